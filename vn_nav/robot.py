@@ -1,0 +1,172 @@
+"""What the stack must know of a robot: its actions, limits, camera and footprint.
+
+Units are SI. Axes follow REP 103: x forward, y left, z up; yaw is positive to the left, pitch is
+positive downwards (a right-handed rotation about y).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import yaml
+
+from vn_nav.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Action:
+    """One discrete action: a displacement of the base (or of the camera's tilt) in its own frame."""
+
+    name: str
+    dx: float = 0.0  # m, forward
+    dy: float = 0.0  # m, left
+    dyaw: float = 0.0  # rad, left
+    dpitch: float = 0.0  # rad, down; carried by Twist.angular.y
+
+    def __post_init__(self):
+        moved = [axis for axis in AXES if getattr(self, axis)]
+        if len(moved) != 1:
+            raise UserError(
+                'an action moves along exactly one of dx, dy, dyaw, dpitch',
+                dataclasses.asdict(self),
+                'split it into several actions',
+            )
+        if not math.isfinite(getattr(self, moved[0])):
+            raise UserError('an action is finite', dataclasses.asdict(self), 'correct the robot file')
+
+    @property
+    def axis(self) -> str:
+        """The one axis it moves along: 'dx', 'dy', 'dyaw' or 'dpitch'."""
+        return next(axis for axis in AXES if getattr(self, axis))
+
+    @property
+    def size(self) -> float:
+        """Signed length [m] or angle [rad] along `axis`."""
+        return getattr(self, self.axis)
+
+
+AXES = ('dx', 'dy', 'dyaw', 'dpitch')
+
+# Thesis, section 5.6 and table 5.5: the actions of the continuous environments.
+THESIS_ACTIONS = (
+    Action('forward', dx=0.5),
+    Action('backward', dx=-0.2),
+    Action('left', dy=0.35),
+    Action('right', dy=-0.35),
+    Action('rotate_left', dyaw=math.radians(30)),
+    Action('rotate_right', dyaw=-math.radians(30)),
+    Action('look_up', dpitch=-math.radians(30)),
+    Action('look_down', dpitch=math.radians(30)),
+)
+# What a differential drive with a fixed camera can do.
+DRIVE_ACTIONS = ('forward', 'backward', 'rotate_left', 'rotate_right')
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotSpec:
+    """A robot as data. The defaults are the standard robot, driven with conservative limits."""
+
+    name: str = 'standard'
+    actions: tuple[Action, ...] = THESIS_ACTIONS
+    footprint_radius: float = 0.18  # m
+    camera_height: float = 1.0  # m above the floor
+    camera_fov: float = math.radians(90)  # rad, horizontal and vertical of the square picture
+    camera_pitch: float = 0.0  # rad, down
+    max_linear: float = 0.3  # m/s
+    max_angular: float = 0.8  # rad/s
+    linear_acceleration: float = 0.5  # m/s^2
+    angular_acceleration: float = 1.6  # rad/s^2
+
+    def __post_init__(self):
+        positive = ('footprint_radius', 'camera_height', 'camera_fov', 'max_linear', 'max_angular',
+                    'linear_acceleration', 'angular_acceleration')
+        for field in positive:
+            value = getattr(self, field)
+            if not (math.isfinite(value) and value > 0):
+                raise UserError(f'{field} of a robot is finite and positive', value,
+                                f'correct {field} of robot {self.name!r}')
+        if len(set(self.action_names)) != len(self.actions) or not self.actions:
+            raise UserError('a robot has at least one action, each with its own name',
+                            self.action_names, f'correct the actions of robot {self.name!r}')
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """The names in table order; an action's index is its place here."""
+        return tuple(action.name for action in self.actions)
+
+    def with_actions(self, names: tuple[str, ...] | list[str]) -> RobotSpec:
+        """The same robot with only the named actions, in the given order.
+
+        Raises:
+            UserError: a name that this robot does not have.
+        """
+        table = {action.name: action for action in self.actions}
+        for name in names:
+            if name not in table:
+                raise UserError(f'every action of the policy exists on robot {self.name!r}', name,
+                                f'its actions are {", ".join(table)}: use another robot file or '
+                                'another checkpoint')
+        return dataclasses.replace(self, actions=tuple(table[name] for name in names))
+
+    def max_velocity(self, axis: str) -> float:
+        """Speed limit [m/s or rad/s] along an axis of `AXES`."""
+        return self.max_linear if axis in ('dx', 'dy') else self.max_angular
+
+    def acceleration(self, axis: str) -> float:
+        """Acceleration limit [m/s^2 or rad/s^2] along an axis of `AXES`."""
+        return self.linear_acceleration if axis in ('dx', 'dy') else self.angular_acceleration
+
+    def nominal_duration(self, action: int) -> float:
+        """Seconds that an action takes from rest to rest under the robot's limits.
+
+        A trapezoidal profile, or a triangular one where the action is too short to reach the limit.
+        """
+        size = abs(self.actions[action].size)
+        axis = self.actions[action].axis
+        speed, acceleration = self.max_velocity(axis), self.acceleration(axis)
+        if size >= speed**2 / acceleration:
+            return size / speed + speed / acceleration
+        return 2.0 * math.sqrt(size / acceleration)
+
+
+def load_robot(path: str | Path) -> RobotSpec:
+    """Read a robot from YAML: the fields of `RobotSpec`; angles in degrees end in `_deg`.
+
+    Raises:
+        UserError: a missing file, an unknown field or a value outside its range.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError('a robot file exists', str(path), 'see config/robots/ for examples')
+    try:
+        data = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise UserError('a robot file is YAML', f'{path}: {error}', 'correct the file') from error
+    if not isinstance(data, dict):
+        raise UserError('a robot file is a YAML mapping', f'{path}: {type(data).__name__}',
+                        'see config/robots/ for examples')
+    data = _degrees_to_radians(data, path)
+    try:
+        if 'actions' in data:
+            data['actions'] = tuple(
+                Action(**_degrees_to_radians(action, path)) for action in data['actions'])
+        return RobotSpec(**data)
+    except TypeError as error:
+        known = ', '.join(field.name for field in dataclasses.fields(RobotSpec))
+        raise UserError('a robot file has only known fields', f'{path}: {error}',
+                        f'the fields are {known}') from error
+
+
+def _degrees_to_radians(data: dict, path: Path) -> dict:
+    out = {}
+    for key, value in data.items():
+        if key.endswith('_deg'):
+            if not isinstance(value, (int, float)):
+                raise UserError(f'{key} is a number of degrees', f'{path}: {value!r}',
+                                'correct the file')
+            out[key.removesuffix('_deg')] = math.radians(value)
+        else:
+            out[key] = value
+    return out

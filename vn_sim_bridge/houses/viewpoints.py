@@ -1,0 +1,46 @@
+"""Where goal pictures are taken: poses from which a room shows a lot of itself."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vn_sim_bridge.houses.house import FloorMap, Room
+from vn_sim_bridge.render.rasterizer import Rasterizer
+from vn_sim_bridge.scene import Scene
+
+CAMERA_HEIGHT = 1.0  # m, the standard robot
+FIELD_OF_VIEW = math.radians(90)
+CANDIDATES = 24  # views looked at in each room
+WALL_DISTANCE = 0.45  # m that a goal keeps from the walls of its room
+
+
+def choose_goals(scene: Scene, rooms: list[Room], floor: FloorMap, rng: np.random.Generator):
+    """The best of some random views in every room, as (pose, room name).
+
+    A view is good when it shows many different things at a few metres' distance: nobody
+    photographs a blank wall to say where to go.
+    """
+    renderer = Rasterizer([scene], 32)
+    centres = floor.centres()
+    goals = []
+    for room in rooms:
+        x0, y0, x1, y1 = room.rect
+        inside = centres[(centres[:, 0] > x0 + WALL_DISTANCE) & (centres[:, 0] < x1 - WALL_DISTANCE)
+                         & (centres[:, 1] > y0 + WALL_DISTANCE)
+                         & (centres[:, 1] < y1 - WALL_DISTANCE)]
+        if len(inside) == 0:
+            continue
+        xy = inside[rng.integers(len(inside), size=CANDIDATES)]
+        yaw = rng.uniform(-math.pi, math.pi, CANDIDATES)
+        cameras = np.column_stack([xy, np.full(CANDIDATES, CAMERA_HEIGHT), yaw,
+                                   np.zeros(CANDIDATES)])
+        _, depth, _, instances = renderer.render(np.zeros(CANDIDATES, np.int64), cameras,
+                                                 FIELD_OF_VIEW)
+        variety = np.array([(np.unique(view, return_counts=True)[1] > 10).sum()
+                            for view in instances])
+        middle = np.median(depth.reshape(CANDIDATES, -1), axis=1)
+        best = int(np.argmax(variety + 3.0 * np.minimum(middle, 2.5)))
+        goals.append(((float(xy[best, 0]), float(xy[best, 1]), float(yaw[best]), 0.0), room.name))
+    return goals

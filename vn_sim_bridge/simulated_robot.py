@@ -1,0 +1,200 @@
+"""One robot in one embedded house, driven by velocities in ticks: the bridge without ROS.
+
+What a tick, a decision and an episode are is docs/architecture.md, "Time". This class judges
+episodes exactly as `NavigationEnv` does, from whatever velocities it is given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from vn_nav.errors import UserError
+from vn_nav.robot import RobotSpec
+from vn_sim_bridge import tasks
+from vn_sim_bridge.backends.base import Frames
+from vn_sim_bridge.backends.house import HouseBackend
+from vn_sim_bridge.counter_random import Stream, normal
+from vn_sim_bridge.houses.house import Goal
+from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.world import motion_noise, nominal_sizes
+
+TICK = 0.05  # s of simulated time
+TERMINATED, TRUNCATED = 1, 2
+
+
+@dataclasses.dataclass
+class Episode:
+    """One journey to one picture."""
+
+    index: int
+    goal: int  # index into the goals; -1: a goal by pose
+    start: tuple[float, ...]  # x, y, yaw, pitch
+    start_distance: float  # m, geodesic
+    begun_at: float  # s, simulated
+    decisions: int = 0
+    collisions: int = 0  # decisions that touched something
+    path_length: float = 0.0  # m
+
+
+@dataclasses.dataclass(frozen=True)
+class Decision:
+    """The judgement at a decision's end."""
+
+    collided: bool
+    success: bool
+    distance: float  # m, geodesic
+    heading_error: float  # rad
+    end: int  # 0: the episode goes on; TERMINATED or TRUNCATED
+
+
+class SimulatedRobot:
+    """Motion, odometry, decisions and episodes of one robot.
+
+    Args:
+        house, rooms: seed of the house and its number of rooms.
+        robot: limits, camera, footprint; its action table gives the noise's nominal sizes.
+        size: side of the pictures [pixels].
+        noise: Gaussian motion noise; odometry reports the motion without it.
+        seed: of starts, goals and noise. Episode e starts as environment e of a `NavigationEnv`
+            with the same seed does.
+        max_decisions: limit of an episode.
+    """
+
+    def __init__(self, house: int, rooms: int, *, robot: RobotSpec, size: int = 84,
+                 noise: bool = True, seed: int = 0, max_decisions: int = 300):
+        self.house = generate_house(house, rooms=rooms)
+        self.robot, self.noise, self.seed, self.max_decisions = robot, noise, seed, max_decisions
+        self.backend = HouseBackend([self.house], [0], robot=robot, size=size)
+        self.fields = [tasks.GoalField(self.house, goal, 1.0) for goal in self.house.goals]
+        self._nominal = nominal_sizes(robot)
+        self.tick_count = 0
+        self.odometry = np.zeros(3)  # x, y, yaw in the odom frame
+        self.velocity = np.zeros(4)  # of the last tick: vx, vy, wz, tilt rate
+        self.episode: Episode | None = None
+        self._field = self.fields[0]
+        self._in_decision = False
+        self._touched = False
+
+    @property
+    def time(self) -> float:
+        """Simulated seconds since the start."""
+        return self.tick_count * TICK
+
+    @property
+    def pose(self) -> np.ndarray:
+        """True x, y, yaw, pitch in the map frame, [4]."""
+        return self.backend.poses[0]
+
+    @property
+    def goal(self) -> Goal:
+        """The goal of the present episode."""
+        return self._field.goal
+
+    def begin_episode(self, index: int, goal_pose: tuple[float, float, float] | None = None
+                      ) -> Episode:
+        """Draw goal and start of episode `index`, and put the robot there.
+
+        Args:
+            goal_pose: x, y [m], yaw [rad] of a goal instead of one of the house's.
+
+        Raises:
+            UserError: a goal where the robot cannot stand.
+        """
+        counter = (self.seed, index, 0)
+        if goal_pose is None:
+            chosen = tasks.draw_goal(len(self.fields), *counter)
+            field = self.fields[chosen]
+        else:
+            chosen, field = -1, self._field_at(*goal_pose)
+        self._field = field
+        start = field.start(1.0, *counter)
+        self.backend.place(np.array([0]), start[None])
+        self._in_decision = self._touched = False
+        self.episode = Episode(index, chosen, tuple(float(v) for v in start),
+                               self.distance(), self.time)
+        return self.episode
+
+    def _field_at(self, x: float, y: float, yaw: float) -> tasks.GoalField:
+        centres = self.house.floor.centres()
+        if not np.isfinite([x, y, yaw]).all() or (
+                np.hypot(*(centres - [x, y]).T).min() > 0.1):
+            raise UserError('a goal lies where the robot can stand', (x, y, yaw),
+                            f'choose a free place within {tuple(self.house.outline)} (x0, y0, x1, '
+                            'y1 in metres); the scene topic has the map')
+        goal = Goal((x, y, yaw, 0.0), self.house.room_at(x, y) or 'door')
+        return tasks.GoalField(self.house, goal, 1.0)
+
+    def goal_frames(self) -> Frames:
+        """The goal picture (and its depth and labels)."""
+        return self.backend.view(np.zeros(1, np.int64), np.array([self.goal.pose]))
+
+    def distance(self) -> float:
+        """Geodesic distance to the goal [m]."""
+        return float(self._field.field.distance(self.pose[None, :2])[0])
+
+    def tick(self, velocity: np.ndarray) -> Decision | None:
+        """Advance by one tick with a velocity in force.
+
+        Args:
+            velocity: [4] vx, vy [m/s], wz, tilt rate [rad/s].
+
+        Returns:
+            The judgement, when this tick ended a decision: the first tick at rest after motion.
+        """
+        self.tick_count += 1
+        self.velocity = np.asarray(velocity, float)
+        if not self.velocity.any():
+            return self.end_decision() if self._in_decision else None
+        self._in_decision = True
+        wanted = self.velocity * TICK
+        delta = self._with_noise(wanted) if self.noise else wanted
+        motion = self.backend.move(delta[None])
+        done = motion.delta[0]
+        length = math.hypot(delta[0], delta[1])
+        travelled = math.hypot(done[0], done[1])
+        self._touched |= bool(motion.collided[0])
+        if self.episode is not None:
+            self.episode.path_length += travelled
+        # Odometry counts wheel turns: what was wanted, as far as nothing stood in the way.
+        share = travelled / length if length > 0 else 1.0
+        heading = self.odometry[2] + wanted[2] / 2
+        cos, sin = math.cos(heading), math.sin(heading)
+        self.odometry += (share * (cos * wanted[0] - sin * wanted[1]),
+                          share * (sin * wanted[0] + cos * wanted[1]), wanted[2])
+        self.odometry[2] = tasks.wrap_angle(self.odometry[2])
+        self.velocity[:2] *= share
+        return None
+
+    def _with_noise(self, wanted: np.ndarray) -> np.ndarray:
+        axis = int(np.argmax(np.abs(wanted)))
+        key = ('+' if wanted[axis] > 0 else '-') + ('dx', 'dy', 'dyaw', 'dpitch')[axis]
+        # A direction without an action of its own (a joystick driving sideways) is as noisy as
+        # the thesis's largest step.
+        nominal = self._nominal.get(key, 0.5)
+        number = normal(self.seed, Stream.MOTION_NOISE, 0, self.episode.index if self.episode
+                        else 0, self.tick_count)
+        return motion_noise(wanted[None], np.array([nominal]), np.atleast_1d(number))[0]
+
+    @property
+    def in_decision(self) -> bool:
+        """Non-zero commands have come since the last judgement."""
+        return self._in_decision
+
+    def end_decision(self) -> Decision:
+        """Judge arrival, collision and the episode's limit."""
+        collided, self._touched, self._in_decision = self._touched, False, False
+        distance = self.distance()
+        error = float(tasks.heading_error(self.pose[2], self.goal.pose[2]))
+        success = bool(tasks.arrived(distance, error))
+        end = 0
+        if self.episode is not None:
+            self.episode.decisions += 1
+            self.episode.collisions += collided
+            if success:
+                end = TERMINATED
+            elif self.episode.decisions >= self.max_decisions:
+                end = TRUNCATED
+        return Decision(collided, success, distance, error, end)
