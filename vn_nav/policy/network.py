@@ -138,13 +138,13 @@ class Policy(nn.Module):
         # and backward one product in place of a slow scatter over the frames that share a goal.
         rows, goal_rows = maps.permute(0, 2, 3, 1), goal_maps.permute(0, 2, 3, 1)
         one_hot = (goal_index.unsqueeze(1) == torch.arange(len(goal_maps))).to(dtype)
-        fused = torch.addmm(rows.flatten(1), one_hot, goal_rows.flatten(1))
-        x = F.relu_(fused.view(rows.shape).permute(0, 3, 1, 2))
+        fused = F.relu(torch.addmm(rows.flatten(1), one_hot, goal_rows.flatten(1)))
+        x = fused.view(rows.shape).permute(0, 3, 1, 2)
         for conv in (self.conv2, self.conv3):
-            x = F.relu_(F.conv2d(x, conv.weight.to(dtype), conv.bias.to(dtype), conv.stride))
+            x = F.relu(F.conv2d(x, conv.weight.to(dtype), conv.bias.to(dtype), conv.stride))
         # Flattened as [channel, row, column], whatever the memory format.
         trunk = self.trunk
-        return F.relu_(F.linear(x.flatten(1), trunk.weight.to(dtype), trunk.bias.to(dtype)))
+        return F.relu(F.linear(x.flatten(1), trunk.weight.to(dtype), trunk.bias.to(dtype)))
 
     def forward(self, obs: Observation, starts: Tensor, state: RecurrentState,
                 goal_maps: Tensor | None = None) -> tuple[PolicyOutput, RecurrentState]:

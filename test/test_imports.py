@@ -1,0 +1,117 @@
+"""ROS stays at the edge, and the packages depend on each other one way only."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
+# The leaves that the simulator may use, and what its node shares with the other nodes.
+LEAVES = {'vn_nav.errors', 'vn_nav.observation', 'vn_nav.robot', 'vn_nav.resources'}
+NODE_SHARED = {'vn_nav.nodes.qos'}
+
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob('*.py'))
+
+
+def name_of(path):
+    """The dotted name of a source file."""
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def at_the_edge(path):
+    """Whether a source file may import ROS."""
+    name = name_of(path)
+    return name.startswith('vn_nav.nodes.') or name == 'vn_sim_bridge.bridge_node'
+
+
+def is_ros(module):
+    """Whether a module comes with ROS: a client library, a message package or a tool."""
+    root = module.partition('.')[0]
+    return (root.endswith(('_msgs', '_interfaces', '_srvs'))
+            or root.startswith(('rcl', 'rosidl', 'rmw', 'ament_', 'launch', 'tf2', 'rosbag2_'))
+            or root == 'cv_bridge')
+
+
+def imported(path):
+    """Every module that a file imports anywhere, functions included."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}: a relative import hides what depends on what'
+            # `from vn_nav import robot` may name a module as well as a function.
+            names |= {node.module} | {f'{node.module}.{alias.name}' for alias in node.names
+                                      if (ROOT / node.module.replace('.', '/')).is_dir()}
+    return names
+
+
+def roots(path):
+    """The top-level packages that a file imports."""
+    return {name.partition('.')[0] for name in imported(path)}
+
+
+def test_every_package_is_whole():
+    folders = {path.parent for path in SOURCES}
+    assert {folder.name for folder in folders} >= set(PACKAGES)
+    missing = [str(folder) for folder in folders if not (folder / '__init__.py').is_file()]
+    assert not missing, f'pip leaves out folders without __init__.py: {missing}'
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=name_of)
+def test_dependencies(path):
+    names = imported(path)
+    if not at_the_edge(path):
+        assert not {name for name in names if is_ros(name)}, 'ROS is imported away from the edge'
+    package = name_of(path).partition('.')[0]
+    if package == 'vn_nav' and name_of(path) != 'vn_nav.cli':
+        assert 'vn_sim_bridge' not in roots(path), 'only vn_nav.cli composes with the simulator'
+    if package == 'vn_sim_bridge':
+        allowed = LEAVES | (NODE_SHARED if at_the_edge(path) else set())
+        used = {name for name in names if name.startswith('vn_nav.')
+                if (ROOT / name.replace('.', '/')).with_suffix('.py').is_file()}
+        assert used <= allowed, f'the simulator knows only the leaves {sorted(allowed)}'
+    if package == 'vn_msgs_py':
+        allowed = {'numpy', 'cv2', 'vn_msgs_py'} | sys.stdlib_module_names
+        assert roots(path) <= allowed, 'vn_msgs_py stands on NumPy and OpenCV alone'
+
+
+BLOCK = """
+import importlib, sys
+sys.path.insert(0, {tests!r})
+from test_imports import is_ros
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if is_ros(name):
+            raise ModuleNotFoundError(f'No module named {{name!r}} (blocked)', name=name)
+
+sys.meta_path.insert(0, Absent())
+try:
+    import rclpy
+except ModuleNotFoundError:
+    pass
+else:
+    raise SystemExit('the block does not work')
+for name in {names!r}:
+    try:
+        importlib.import_module(name)
+    except Exception as error:
+        raise SystemExit(f'import {{name}}: {{type(error).__name__}}: {{error}}')
+print('imported', len({names!r}))
+"""
+
+
+def test_the_rest_imports_without_ros(tmp_path):
+    names = [name_of(path) for path in SOURCES if not at_the_edge(path)]
+    code = BLOCK.format(tests=str(Path(__file__).parent), names=names)
+    result = subprocess.run(
+        [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'})
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert f'imported {len(names)}' in result.stdout

@@ -1,0 +1,1 @@
+"""Learning: rollouts, returns, losses and the trainer."""

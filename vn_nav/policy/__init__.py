@@ -1,0 +1,1 @@
+"""The policy: its network, its checkpoints and its NumPy runtime."""

@@ -1,0 +1,1 @@
+"""Simulators behind one protocol: motion and pixels, no tasks."""

@@ -1,0 +1,1 @@
+"""Sources of houses: each turns a description into a Scene with goals and distances."""

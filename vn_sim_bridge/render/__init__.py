@@ -1,0 +1,1 @@
+"""Renderers: a Scene and poses become colour, depth and labels."""
