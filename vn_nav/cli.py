@@ -1,0 +1,223 @@
+"""The `vn_nav` command: the one place where simulator and stack meet."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import math
+import os
+import platform
+import shlex
+import sys
+from pathlib import Path
+
+from vn_nav import __version__
+from vn_nav.errors import UserError
+
+BACKENDS = ('house',)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog='vn_nav', description='Visual navigation for ROS 2: show a robot a picture, and it '
+        'drives to where the picture was taken.')
+    parser.add_argument('--version', action='version', version=f'vn_nav {__version__}')
+    commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
+
+    demo = commands.add_parser('demo', help='watch the shipped policy drive over ROS 2')
+    demo.add_argument('--out', type=Path, default=Path('demo'), help='folder for bag and page')
+    demo.add_argument('--episodes', type=int, default=20, help='in the trained house')
+    demo.add_argument('--unseen-episodes', type=int, default=10, help='in an unseen house')
+    demo.add_argument('--checkpoint', type=Path, help='instead of the shipped policy')
+    demo.set_defaults(run=run_demo)
+
+    train = commands.add_parser('train', help='train a policy')
+    _add_world(train)
+    train.add_argument('--out', type=Path, required=True, help='folder of the run')
+    train.add_argument('--resume', action='store_true', help='go on with the run in --out')
+    train.add_argument('--frames', type=float, default=1.5e6, help='agent decisions')
+    train.add_argument('--minutes', type=float, help='stop after this wall-clock time')
+    train.add_argument('--envs', type=int, default=64)
+    train.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
+    train.add_argument('--progress-reward', type=float, default=1.0, help='per metre')
+    train.add_argument('--collision-reward', type=float, default=-0.02, help='per contact')
+    train.add_argument('--learning-rate', type=float, default=4e-4)
+    train.add_argument('--epochs', type=int, default=2)
+    train.add_argument('--no-bf16', action='store_true', help='float32 throughout')
+    train.add_argument('--threads', type=int, default=1)
+    train.set_defaults(run=run_train)
+
+    evaluate = commands.add_parser('evaluate', help='measure a checkpoint')
+    evaluate.add_argument('checkpoint', type=Path)
+    _add_world(evaluate, defaults=False)
+    evaluate.add_argument('--episodes', type=int, default=100)
+    evaluate.add_argument('--max-decisions', type=int, default=300)
+    evaluate.add_argument('--decoding', choices=('sample', 'greedy'))
+    evaluate.add_argument('--no-controls', action='store_true')
+    evaluate.add_argument('--json', type=Path, help='also write the figures here')
+    evaluate.set_defaults(run=run_evaluate)
+
+    publish = commands.add_parser(
+        'publish', help='measure a run and write it as a checkpoint to ship')
+    publish.add_argument('source', type=Path, help='checkpoint of a training run')
+    publish.add_argument('target', type=Path, help='for example models/house')
+    publish.add_argument('--unseen', type=int, required=True, help='seed of a held-out house')
+    publish.add_argument('--episodes', type=int, default=100)
+    publish.set_defaults(run=run_publish)
+    return parser
+
+
+def _add_world(parser: argparse.ArgumentParser, defaults: bool = True) -> None:
+    parser.add_argument('--backend', default='house', help=f'one of: {", ".join(BACKENDS)}')
+    parser.add_argument('--house', type=int, action='append', metavar='SEED',
+                        help='seed of a house; may be given several times')
+    parser.add_argument('--rooms', type=int, default=5 if defaults else None)
+    parser.add_argument('--seed', type=int, default=0 if defaults else 10_000)
+
+
+def _check_backend(name: str) -> None:
+    if name not in BACKENDS:
+        raise UserError(f'the backend is one of: {", ".join(BACKENDS)}', name, 'choose one')
+
+
+def make_env(houses, rooms: int, envs: int, threads: int = 1, **options):
+    """A `NavigationEnv` of embedded houses with the standard robot."""
+    from vn_sim_bridge.env import EnvConfig, NavigationEnv
+    return NavigationEnv(EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs, **options),
+                         threads=threads)
+
+
+def run_train(args) -> int:
+    """`vn_nav train`."""
+    _check_backend(args.backend)
+    from vn_nav.learning.learner import LearnerConfig
+    from vn_nav.learning.trainer import TrainConfig, train
+    houses = args.house or [0]
+    env = make_env(houses, args.rooms, args.envs, args.threads, size=args.size, seed=args.seed,
+                   progress_reward=args.progress_reward, collision_reward=args.collision_reward)
+    learner = LearnerConfig(learning_rate=args.learning_rate, epochs=args.epochs,
+                            bf16=not args.no_bf16)
+    config = TrainConfig(frames=int(args.frames), seed=args.seed, minutes=args.minutes,
+                         threads=args.threads, learner=learner)
+    words = [word for word in sys.argv[1:] if word != '--resume']
+    info = {
+        'world_version': env.world_version, 'houses': houses, 'rooms': args.rooms,
+        'command': 'vn_nav ' + shlex.join(words), 'machine': machine(),
+        'date': datetime.date.today().isoformat(),
+        'camera_fov_deg': math.degrees(env.robot.camera_fov),
+        'camera_height': env.robot.camera_height,
+    }
+    print(train(env, config, args.out, info, resume=args.resume))
+    return 0
+
+
+def machine() -> str:
+    """The processor in words."""
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+        model = next(line.split(':', 1)[1].strip() for line in lines if 'model name' in line)
+    except (OSError, StopIteration):
+        model = platform.processor() or platform.machine()
+    return f'{model}, {os.cpu_count()} cores'
+
+
+def _load(path: Path):
+    """A checkpoint for the present world, with actions of the standard robot."""
+    from vn_nav.policy.checkpoint import load_checkpoint
+    from vn_nav.robot import RobotSpec
+    from vn_sim_bridge.world import WORLD_VERSION
+    checkpoint = load_checkpoint(path, expect_world=WORLD_VERSION)
+    RobotSpec().with_actions(checkpoint.config.actions)  # or says which action is unknown
+    return checkpoint
+
+
+def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, controls: bool = True,
+            decoding: str | None = None, max_decisions: int = 300) -> dict:
+    """Figures of a loaded checkpoint in some houses."""
+    from vn_nav.evaluation.evaluator import evaluate
+    env = make_env(houses, rooms, min(50, episodes), size=checkpoint.config.size,
+                   actions=checkpoint.config.actions, max_decisions=max_decisions)
+    return evaluate(env, checkpoint.network, decoding=decoding or checkpoint.info['decoding'],
+                    episodes=episodes, controls=controls, seed=seed)
+
+
+def run_evaluate(args) -> int:
+    """`vn_nav evaluate`."""
+    _check_backend(args.backend)
+    if args.episodes < 1:
+        raise UserError('there is at least one episode', args.episodes, 'raise --episodes')
+    checkpoint = _load(args.checkpoint)
+    houses = args.house or checkpoint.info['houses']
+    rooms = args.rooms or checkpoint.info['rooms']
+    results = measure(checkpoint, houses, rooms, episodes=args.episodes, seed=args.seed,
+                      controls=not args.no_controls, decoding=args.decoding,
+                      max_decisions=args.max_decisions)
+    show_results(results, f'{args.checkpoint} in house {", ".join(map(str, houses))}, '
+                          f'{args.max_decisions} decisions at most')
+    if args.json:
+        args.json.write_text(json.dumps(results, indent=2))
+    return 0
+
+
+def show_results(results: dict, title: str) -> None:
+    """Print figures as a table."""
+    from rich.console import Console
+    from rich.table import Table
+    table = Table(title=title)
+    for heading in ('policy', 'episodes', 'success (95 %)', 'SPL', 'decisions', 'seconds',
+                    'collisions', 'contact-free', 'stop error', 'return'):
+        table.add_column(heading, justify='left' if heading == 'policy' else 'right')
+    for name, r in results.items():
+        low, high = r['success_interval']
+        table.add_row(name, str(r['episodes']), f'{r["success"]:.2f} ({low:.2f}-{high:.2f})',
+                      f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["seconds"]:.0f}',
+                      f'{r["collisions"]:.1%}', f'{r["contact_free_success"]:.2f}',
+                      f'{r["stop_error_m"]:.2f} m {r["stop_error_deg"]:.0f} deg',
+                      f'{r["return"]:.2f}')
+    Console().print(table)
+
+
+def run_publish(args) -> int:
+    """`vn_nav publish`."""
+    from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
+    checkpoint = _load(args.source)
+    info = {key: value for key, value in checkpoint.info.items()
+            if key not in ('sha256', 'format', 'results')}
+    save_checkpoint(args.target, checkpoint.network, info, half=True)
+    shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
+    houses, rooms = info['houses'], info['rooms']
+    places = {f'Trained house (seed {", ".join(map(str, houses))}), 300 decisions': houses,
+              f'A house it never saw (seed {args.unseen}), 300 decisions': [args.unseen]}
+    info['results'] = {}
+    for place, seeds in places.items():
+        info['results'][place] = measure(shipped, seeds, rooms, episodes=args.episodes,
+                                         seed=10_000)
+        show_results(info['results'][place], place)
+    info['unseen_house'] = args.unseen
+    save_checkpoint(args.target, shipped.network, info, half=True)
+    return 0
+
+
+def run_demo(args) -> int:
+    """`vn_nav demo`."""
+    from vn_nav.demo import run
+    return run(args.out, episodes=args.episodes, unseen_episodes=args.unseen_episodes,
+               checkpoint=args.checkpoint)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point: 2 and one line on standard error for bad input."""
+    args = build_parser().parse_args(argv)
+    try:
+        return args.run(args)
+    except UserError as error:
+        print(f'vn_nav: {error}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == '__main__':
+    sys.exit(main())

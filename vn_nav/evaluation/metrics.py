@@ -1,0 +1,74 @@
+"""What every figure means (docs/architecture.md, "Figures"), as pure functions over episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+ARRIVAL_RADIUS = 0.6  # m: what the start distance is shortened by in SPL
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """The outcome of one journey to one picture."""
+
+    success: bool
+    start_distance: float  # m, geodesic, from start to goal
+    path_length: float  # m really moved
+    decisions: int
+    collisions: int  # decisions that touched something
+    seconds: float  # at the robot's default limits
+    stop_distance: float  # m, geodesic, at the end
+    stop_heading: float  # rad, unsigned, at the end
+    reward: float = 0.0  # undiscounted return
+    goal: str = ''
+
+
+def path_efficiency(episode: Episode) -> float:
+    """S * l / max(p, l): the episode's share in SPL (Anderson et al. 2018).
+
+    l is the geodesic start distance less the arrival radius, p the metres really moved.
+    """
+    shortest = max(episode.start_distance - ARRIVAL_RADIUS, 0.0)
+    longest = max(episode.path_length, shortest)
+    return float(episode.success) * (shortest / longest if longest > 0 else 1.0)
+
+
+def bootstrap_interval(values: Sequence[float], *, samples: int = 2000, seed: int = 0
+                       ) -> tuple[float, float]:
+    """95 % interval of the mean by resampling episodes."""
+    values = np.asarray(values, float)
+    rng = np.random.default_rng(seed)
+    means = values[rng.integers(len(values), size=(samples, len(values)))].mean(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def summarise(episodes: Sequence[Episode]) -> dict:
+    """All figures over some episodes, ready for JSON.
+
+    Raises:
+        ValueError: no episodes.
+    """
+    if not episodes:
+        raise ValueError('figures need at least one episode; received none')
+    success = [float(e.success) for e in episodes]
+    decisions = sum(e.decisions for e in episodes)
+    return {
+        'episodes': len(episodes),
+        'success': float(np.mean(success)),
+        'success_interval': list(bootstrap_interval(success)),
+        'spl': float(np.mean([path_efficiency(e) for e in episodes])),
+        'collisions': sum(e.collisions for e in episodes) / max(decisions, 1),
+        'contact_free_success': float(np.mean(
+            [e.success and e.collisions == 0 for e in episodes])),
+        'stop_error_m': float(np.mean([e.stop_distance for e in episodes])),
+        'stop_error_deg': math.degrees(float(np.mean([e.stop_heading for e in episodes]))),
+        'decisions': decisions / len(episodes),
+        'seconds': float(np.mean([e.seconds for e in episodes])),
+        'return': float(np.mean([e.reward for e in episodes])),
+        'start_distance': float(np.mean([e.start_distance for e in episodes])),
+    }
