@@ -1,8 +1,15 @@
-"""The batch that learning consumes, and how it is collected from an environment."""
+"""The batch that learning consumes, and how it is collected from an environment.
+
+Time under NEXT_STEP autoreset, for an episode that ends with the action of row t: row t+1 shows its
+true last observation, whose value bootstraps a truncated episode; the environment ignores the
+action of that row, so it is no frame (`valid` is False). Row t+2 begins the next episode
+(`starts`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,16 +23,16 @@ from vn_nav.policy.network import Policy, RecurrentState
 class Rollout:
     """T steps of B environments, time-major."""
 
-    observation: Observation  # [T+1,B]
+    observation: Observation  # [T+1,B]; pictures lie in memory as [T+1,B,H,W,3]
     starts: Tensor  # [T+1,B] bool: an episode begins at this observation
     action: Tensor  # [T,B] int64
     reward: Tensor  # [T,B] float32, shaping included
     terminated: Tensor  # [T,B] bool
     truncated: Tensor  # [T,B] bool
-    valid: Tensor  # [T,B] bool: False on reset rows (NEXT_STEP autoreset), which are no frames
+    valid: Tensor  # [T,B] bool: False on reset rows, which are no frames
     log_probability: Tensor  # [T,B] of the action when it was chosen
-    value: Tensor  # [T+1,B] when it was chosen
-    state: RecurrentState  # before the first step, [B,hidden]
+    value: Tensor  # [T+1,B] when it was seen
+    state: RecurrentState  # before the first row
 
     @property
     def frames(self) -> int:
@@ -33,90 +40,122 @@ class Rollout:
         return int(self.valid.sum())
 
 
-@dataclasses.dataclass
-class EpisodeEnds:
-    """The episodes that ended during a rollout, in the order of their ends."""
+class Episode(NamedTuple):
+    """What is kept of a finished episode."""
 
-    success: list[bool] = dataclasses.field(default_factory=list)
-    decisions: list[int] = dataclasses.field(default_factory=list)
-    env: list[int] = dataclasses.field(default_factory=list)
+    env: int
+    number: int  # how many episodes this environment had begun before, since training began
+    success: bool
+    reward: float  # undiscounted return, shaping included
+    decisions: int
+    collisions: int  # decisions that touched something
 
 
 class Collector:
-    """Steps an environment with a network and keeps both their states between rollouts.
+    """Acts in an environment by sampling, and keeps both their states between rollouts.
 
     Args:
-        env: a vector environment with dict observations as `NavigationEnv` makes them.
-        network: acts by sampling.
+        env: a vector environment that observes as `vn_sim_bridge.env.NavigationEnv` does.
+        network: the policy; it acts in its `compute_dtype`.
         generator: source of the sampled actions.
     """
 
-    def __init__(self, env, network: Policy, *, generator: torch.Generator):
+    def __init__(self, env, network: Policy, generator: torch.Generator):
         self.env, self.network, self.generator = env, network, generator
         self.goals = torch.from_numpy(np.ascontiguousarray(env.goals))
-        self.observation = None
-        self.starts = torch.ones(env.num_envs, dtype=torch.bool)
-        self.state = network.initial_state(env.num_envs)
-        self.collisions = 0
+        n = env.num_envs
+        self.observation: dict[str, np.ndarray] = {}
+        self.starts = torch.ones(n, dtype=torch.bool)
+        self.state = network.initial_state(n)
+        self.number = np.zeros(n, np.int64)  # of each environment's present episode
+        self._reward = np.zeros(n)
+        self._decisions = np.zeros(n, np.int64)
+        self._collisions = np.zeros(n, np.int64)
 
     def begin(self, seed: int) -> None:
         """Reset every environment."""
         self.observation, _ = self.env.reset(seed=seed)
         self.starts[:] = True
-        self.state = self.network.initial_state(self.env.num_envs)
+        self.number += 1
+        for total in (self._reward, self._decisions, self._collisions):
+            total[:] = 0
 
     @torch.no_grad()
-    def collect(self, steps: int) -> tuple[Rollout, EpisodeEnds]:
-        """Act for a number of steps."""
-        batch, size = self.env.num_envs, self.goals.shape[-1]
-        # Stored channels last, which is how the convolutions read them.
-        images = torch.empty(steps + 1, batch, size, size, 3, dtype=torch.uint8)
-        images = images.permute(0, 1, 4, 2, 3)
-        goal_index = torch.empty(steps + 1, batch, dtype=torch.int64)
-        last_action = torch.empty(steps + 1, batch, dtype=torch.int64)
-        last_reward = torch.empty(steps + 1, batch)
-        starts = torch.empty(steps + 1, batch, dtype=torch.bool)
-        value = torch.empty(steps + 1, batch)
-        action = torch.empty(steps, batch, dtype=torch.int64)
-        log_probability = torch.empty(steps, batch)
-        reward = torch.empty(steps, batch)
-        terminated = torch.empty(steps, batch, dtype=torch.bool)
-        truncated = torch.empty(steps, batch, dtype=torch.bool)
-        valid = torch.empty(steps, batch, dtype=torch.bool)
-        first_state, ends = self.state, EpisodeEnds()
-        self.collisions = 0
+    def collect(self, steps: int) -> tuple[Rollout, list[Episode]]:
+        """Act for a number of steps; also the episodes that ended, in the order of their ends."""
+        n, size = self.env.num_envs, self.goals.shape[-1]
+        flag, real, whole = torch.bool, torch.float32, torch.int64
+
+        def empty(length: int, dtype: torch.dtype) -> Tensor:
+            return torch.empty(length, n, dtype=dtype)
+
+        # Channels last, as the convolutions read them.
+        image = torch.empty(steps + 1, n, size, size, 3, dtype=torch.uint8).permute(0, 1, 4, 2, 3)
+        seen = Observation(image, self.goals, empty(steps + 1, whole), empty(steps + 1, whole),
+                           empty(steps + 1, real))
+        rollout = Rollout(
+            seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
+            empty(steps, flag), empty(steps, flag), empty(steps, flag), empty(steps, real),
+            empty(steps + 1, real), self.state)
         goal_maps = self.network.encode_goals(self.goals)
-        for step in range(steps + 1):
-            images[step] = torch.from_numpy(self.observation['image'])
-            goal_index[step] = torch.from_numpy(self.observation['goal_index'])
-            last_action[step] = torch.from_numpy(self.observation['last_action'])
-            last_reward[step] = torch.from_numpy(self.observation['last_reward'])
-            starts[step] = self.starts
-            now = slice(step, step + 1)
-            seen = Observation(images[now], self.goals, goal_index[now], last_action[now],
-                               last_reward[now])
-            output, state = self.network(seen, starts[now], self.state, goal_maps)
-            value[step] = output.value[0]
-            if step == steps:
-                break  # the last observation only bootstraps; the next rollout begins with it
+        episodes: list[Episode] = []
+        for t in range(steps + 1):
+            for name, rows in seen._asdict().items():
+                if name != 'goals':
+                    rows[t] = torch.from_numpy(self.observation[name])
+            rollout.starts[t] = self.starts
+            now = slice(t, t + 1)
+            row = Observation(image[now], self.goals, *(part[now] for part in seen[2:]))
+            output, state = self.network(row, rollout.starts[now], self.state, goal_maps)
+            rollout.value[t] = output.value[0]
+            if t == steps:
+                break  # this observation only bootstraps; the next rollout begins with it
             self.state = state
-            log_probabilities = torch.log_softmax(output.logits[0], dim=-1)
-            chosen = torch.multinomial(log_probabilities.exp(), 1, generator=self.generator)
-            action[step] = chosen[:, 0]
-            log_probability[step] = log_probabilities.gather(1, chosen)[:, 0]
-            self.observation, rewards, ended, timed_out, info = self.env.step(
-                action[step].numpy())
-            reward[step] = torch.from_numpy(rewards)
-            terminated[step] = torch.from_numpy(ended)
-            truncated[step] = torch.from_numpy(timed_out)
-            reset = torch.from_numpy(info['reset'])
-            valid[step] = ~reset
-            self.starts = reset
-            self.collisions += int(info['collided'].sum())
-            for n in np.nonzero(ended | timed_out)[0]:
-                ends.success.append(bool(info['success'][n]))
-                ends.decisions.append(int(info['decisions'][n]))
-                ends.env.append(int(n))
-        observation = Observation(images, self.goals, goal_index, last_action, last_reward)
-        return Rollout(observation, starts, action, reward, terminated, truncated, valid,
-                       log_probability, value, first_state), ends
+            log_probability = torch.log_softmax(output.logits[0], dim=-1)
+            action = torch.multinomial(log_probability.exp(), 1, generator=self.generator)
+            rollout.action[t] = action[:, 0]
+            rollout.log_probability[t] = log_probability.gather(1, action)[:, 0]
+            self._step(rollout, t, episodes)
+        return rollout, episodes
+
+    def _step(self, rollout: Rollout, t: int, episodes: list[Episode]) -> None:
+        """Step the environment with row t's actions and write down what came of it."""
+        self.observation, reward, terminated, truncated, info = self.env.step(
+            rollout.action[t].numpy())
+        reset = np.asarray(info['reset'])
+        rollout.reward[t] = torch.from_numpy(np.asarray(reward, np.float32))
+        rollout.terminated[t] = torch.from_numpy(terminated)
+        rollout.truncated[t] = torch.from_numpy(truncated)
+        self.starts = torch.from_numpy(reset.copy())
+        rollout.valid[t] = ~self.starts
+        self.number += reset
+        for total in (self._reward, self._decisions, self._collisions):
+            total[reset] = 0
+        self._reward += np.where(reset, 0.0, reward)
+        self._decisions += ~reset
+        self._collisions += info['collided'] & ~reset
+        for e in np.nonzero(terminated | truncated)[0]:
+            episodes.append(Episode(
+                int(e), int(self.number[e]), bool(info['success'][e]), float(self._reward[e]),
+                int(self._decisions[e]), int(self._collisions[e])))
+
+    def state_dict(self) -> dict:
+        """Everything but the environment, as plain tensors."""
+        return {
+            'observation': {name: torch.from_numpy(np.array(rows))
+                            for name, rows in self.observation.items()},
+            'starts': self.starts.clone(),
+            'memory': [part.clone() for part in self.state],
+            'totals': [torch.from_numpy(total.copy()) for total in self._totals()],
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on where `state_dict` was taken; the environment must stand there too."""
+        self.observation = {name: rows.numpy() for name, rows in state['observation'].items()}
+        self.starts = state['starts']
+        self.state = RecurrentState(*state['memory'])
+        for total, saved in zip(self._totals(), state['totals'], strict=True):
+            total[:] = saved.numpy()
+
+    def _totals(self) -> tuple[np.ndarray, ...]:
+        return self.number, self._reward, self._decisions, self._collisions

@@ -1,18 +1,18 @@
-"""Checkpoints: a folder with model.safetensors, config.json and README.md (the model card).
+"""Checkpoints: a folder with `model.safetensors`, `config.json` and a model card, `README.md`.
 
-The network's shape comes from config.json alone; nothing in the folder can execute code.
+Nothing in it is executable: weights are safetensors, everything else is JSON and text.
 """
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import safetensors
 import safetensors.torch
@@ -21,140 +21,284 @@ import torch
 from vn_nav.errors import UserError
 from vn_nav.policy.network import NetworkConfig, Policy
 
-FORMAT = 1  # of config.json
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
+FORMAT = 1
 DECODINGS = ('sample', 'greedy')
+REQUIRED = object()
+# What a checkpoint says beside its weights, and what it says when nobody told it.
+INFO = {
+    'world_version': REQUIRED,  # of the simulator's pixels, houses and motion
+    'camera_fov_deg': REQUIRED,  # of the square picture
+    'camera_height': REQUIRED,  # m above the floor
+    'decoding': 'sample',  # the rule that `results` were measured with
+    'houses': [],  # seeds
+    'rooms': None,  # of each house
+    'seed': None,
+    'frames': 0,  # agent decisions
+    'minutes': 0.0,  # wall-clock of training
+    'command': '',  # that trained it
+    'results': {},  # measured figures and controls, by name
+    'notes': '',
+}
 
 
-class Checkpoint(NamedTuple):
-    """A loaded checkpoint."""
+@dataclasses.dataclass(frozen=True)
+class LoadedCheckpoint:
+    """A checkpoint in memory."""
 
     network: Policy  # in evaluation mode, float32
     config: NetworkConfig
-    info: dict  # everything else of config.json: world_version, houses, frames, results, ...
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Replace a file so that a crash leaves the old or the new content, never a part."""
-    temporary = path.with_name(path.name + '.part')
-    with open(temporary, 'wb') as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    info: dict  # the keys of `INFO`, and 'sha256' of the weights
 
 
 def save_checkpoint(folder: str | Path, network: Policy, info: dict, *, half: bool = False) -> None:
-    """Write a checkpoint; the folder appears, or is replaced, as a whole.
+    """Write a checkpoint; the folder appears, or is replaced, whole or not at all.
 
     Args:
-        folder: where to.
-        network: the weights and their configuration.
-        info: JSON facts about the training: world_version, houses, rooms, seed, frames, minutes,
-            command, camera_fov_deg, camera_height, decoding, results.
-        half: store the weights in half precision.
-    """
-    folder = Path(folder)
-    fresh = folder.with_name(folder.name + '.part')
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir(parents=True)
-    tensors = {name: tensor.detach().to(torch.float16 if half else torch.float32).contiguous()
-               for name, tensor in network.state_dict().items()}
-    weights = safetensors.torch.save(tensors)
-    config = {'format': FORMAT, 'network': dataclasses.asdict(network.config),
-              'sha256': hashlib.sha256(weights).hexdigest(), **info}
-    write_atomically(fresh / WEIGHTS, weights)
-    write_atomically(fresh / CONFIG, json.dumps(config, indent=2).encode())
-    write_atomically(fresh / CARD, model_card(folder.name, config).encode())
-    old = folder.with_name(folder.name + '.old')
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        os.rename(folder, old)
-    os.rename(fresh, folder)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def load_checkpoint(folder: str | Path, *, expect_actions: Sequence[str] | None = None,
-                    expect_world: str | None = None) -> Checkpoint:
-    """Read and verify a checkpoint.
-
-    Args:
-        folder: what `save_checkpoint` wrote.
-        expect_actions: action names that the caller's robot or environment has, in its order.
-        expect_world: world version of the simulator that will be used.
+        folder: where; its parent is made.
+        network: the policy.
+        info: some of the keys of `INFO`.
+        half: store weights in 16 bits, half the size.
 
     Raises:
-        UserError: anything missing, corrupt or different from what is expected.
+        UserError: a missing or unknown key of `info`, a value that JSON cannot hold, or a weight
+            that is not finite.
+    """
+    folder = Path(folder)
+    info = _check_info(info, 'the checkpoint to save')
+    tensors = {}
+    for name, tensor in network.state_dict().items():
+        stored = tensor.detach().to(torch.float16 if half else torch.float32)
+        if not torch.isfinite(stored).all():
+            raise UserError('weights are finite and within their type', name,
+                            'go back to an earlier checkpoint, or store them in 32 bits')
+        tensors[name] = stored.contiguous()
+    weights = safetensors.torch.save(tensors)
+    config = {
+        'format': FORMAT,
+        'network': dataclasses.asdict(network.config),
+        'action_names': list(network.config.actions),
+        'sha256': hashlib.sha256(weights).hexdigest(),
+        **info,
+    }
+    del config['network']['actions']  # said once, under action_names
+    try:
+        text = json.dumps(config, indent=2, allow_nan=False) + '\n'
+    except (TypeError, ValueError) as error:
+        raise UserError('info holds only JSON values', str(error), 'convert them first') from error
+    parameters = sum(tensor.numel() for tensor in tensors.values())
+    files = {WEIGHTS: weights, CONFIG: text.encode(),
+             CARD: model_card(config, parameters, len(weights)).encode()}
+    _write_folder(folder, files)
+
+
+def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None = None
+                    ) -> LoadedCheckpoint:
+    """Read a checkpoint and verify it.
+
+    Args:
+        folder: a checkpoint folder.
+        expect_actions: refuse any other action names or order.
+
+    Raises:
+        UserError: a missing file, corrupt weights, another architecture, unknown keys, or other
+            actions.
     """
     folder = Path(folder)
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
-            raise UserError(f'a checkpoint is a folder with {CONFIG} and {WEIGHTS}', str(folder),
-                            'give the folder of a trained model, for example models/house')
+            raise UserError(f'a checkpoint is a folder with {CONFIG} and {WEIGHTS}',
+                            str(folder / name), 'pass such a folder; shipped ones are in models/')
     try:
-        info = json.loads((folder / CONFIG).read_text())
-        shape = {**info.pop('network')}
-        config = NetworkConfig(**shape)
-        checksum, version = info['sha256'], info['format']
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f'{CONFIG} describes a network of this program', f'{folder}: {error!r}',
-                        'take the checkpoint from its source again') from error
-    if version != FORMAT:
-        raise UserError(f'the checkpoint has format {FORMAT}', version,
-                        'use the version of vn_nav that wrote it')
+        config = json.loads((folder / CONFIG).read_text())
+    except ValueError as error:
+        raise UserError(f'{CONFIG} is JSON', f'{folder / CONFIG}: {error}',
+                        'get the checkpoint again') from error
+    if not isinstance(config, dict) or config.get('format') != FORMAT:
+        received = config.get('format') if isinstance(config, dict) else type(config).__name__
+        raise UserError(f'{CONFIG} has format {FORMAT}', received,
+                        'use the version of vn_nav that wrote it, or train again')
+    where = str(folder / CONFIG)
+    own = {'format', 'network', 'action_names', 'sha256'}
+    missing = own - config.keys()
+    if missing:
+        raise UserError(f'{CONFIG} has the keys {", ".join(sorted(own))}',
+                        f'{where} without {", ".join(sorted(missing))}', 'get the checkpoint again')
+    info = _check_info({key: value for key, value in config.items() if key not in own}, where)
     weights = (folder / WEIGHTS).read_bytes()
-    if hashlib.sha256(weights).hexdigest() != checksum:
-        raise UserError(f'the SHA-256 of {WEIGHTS} is the one in {CONFIG}', str(folder),
-                        'the file is damaged: take the checkpoint from its source again')
-    if expect_actions is not None and tuple(expect_actions) != config.actions:
-        raise UserError(f'the checkpoint was trained with the actions {", ".join(expect_actions)}',
-                        ', '.join(config.actions), 'use the robot it was trained for, or train '
-                        'one for this robot')
-    if expect_world is not None and info.get('world_version') != expect_world:
-        raise UserError(f'the checkpoint belongs to world version {expect_world!r}',
-                        info.get('world_version'), 'train it again (vn_nav train), or install '
-                        'the version of vn_nav that it came with')
-    network = Policy(config)
+    digest = hashlib.sha256(weights).hexdigest()
+    if digest != config['sha256']:
+        raise UserError(f'the SHA-256 of {WEIGHTS} is the one in {CONFIG}', digest,
+                        f'the file is corrupt or not the one of {where}: get it again')
+    try:
+        network_config = NetworkConfig(actions=tuple(config['action_names']), **config['network'])
+    except TypeError as error:
+        known = ', '.join(field.name for field in dataclasses.fields(NetworkConfig))
+        raise UserError(f'the network in {CONFIG} has only the fields {known}', f'{where}: {error}',
+                        'use the version of vn_nav that wrote it, or train again') from error
+    if expect_actions is not None and tuple(expect_actions) != network_config.actions:
+        raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
+                        ', '.join(network_config.actions), 'use a checkpoint trained for them')
+    network = Policy(network_config)
+    _load_weights(network, weights, str(folder / WEIGHTS))
+    return LoadedCheckpoint(network.eval(), network_config, {**info, 'sha256': digest})
+
+
+def _load_weights(network: Policy, weights: bytes, where: str) -> None:
     try:
         tensors = safetensors.torch.load(weights)
-        network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-    except (RuntimeError, safetensors.SafetensorError) as error:
-        first = str(error).splitlines()[0]
-        raise UserError('the weights fit the network of config.json', f'{folder}: {first}',
-                        'take the checkpoint from its source again') from error
-    return Checkpoint(network.eval(), config, info)
+    except safetensors.SafetensorError as error:
+        raise UserError(f'{WEIGHTS} is a safetensors file', f'{where}: {error}',
+                        'get the checkpoint again') from error
+    wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    if wanted != found:
+        name = sorted(name for name in wanted.keys() | found.keys()
+                      if wanted.get(name) != found.get(name))[0]
+        raise UserError(f'{WEIGHTS} fits the network of {CONFIG}: {name} is {wanted.get(name)}',
+                        f'{found.get(name)} in {where}', 'get the checkpoint again')
+    for name, tensor in tensors.items():
+        if tensor.dtype not in (torch.float16, torch.float32) or not torch.isfinite(tensor).all():
+            raise UserError('weights are finite numbers of 16 or 32 bits', f'{name} in {where}',
+                            'get the checkpoint again')
+    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
 
 
-def model_card(name: str, config: dict) -> str:
-    """The README.md of a checkpoint: what it is, how it was made, how well it does."""
-    lines = [f'# {name}', '',
-             'A goal-picture navigation policy of vn_nav: it sees the camera picture and a goal '
-             'picture and chooses one of ' + ', '.join(f'`{a}`' for a in config['network']['actions'])
-             + '.', '', '| fact | value |', '|---|---|']
-    facts = {'trained in houses (seeds)': 'houses', 'rooms': 'rooms',
-             'world version': 'world_version', 'command': 'command', 'seed': 'seed',
-             'frames (agent decisions)': 'frames', 'wall-clock minutes': 'minutes',
-             'machine': 'machine', 'date': 'date', 'camera field of view [deg]': 'camera_fov_deg',
-             'camera height [m]': 'camera_height', 'decoding': 'decoding'}
-    for title, key in facts.items():
-        if key in config:
-            value = f'`{config[key]}`' if key == 'command' else config[key]
-            lines.append(f'| {title} | {value} |')
-    for place, results in config.get('results', {}).items():
-        lines += ['', f'## {place}', '', results_table(results)]
+def _check_info(info: dict, where: str) -> dict:
+    unknown = sorted(info.keys() - INFO.keys())
+    if unknown:
+        raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} beside the network',
+                        f'{unknown[0]} in {where}', 'remove it, or use the version of vn_nav '
+                        'that wrote it')
+    full = {key: info.get(key, default) for key, default in INFO.items()}
+    missing = [key for key, value in full.items() if value is REQUIRED]
+    if missing:
+        raise UserError(f'{CONFIG} has the key {missing[0]}', f'{where} without it', 'add it')
+    if full['decoding'] not in DECODINGS:
+        raise UserError('decoding is sample or greedy', full['decoding'], f'correct {where}')
+    for key, limit in (('camera_fov_deg', 179.0), ('camera_height', 100.0)):
+        value = full[key]
+        if not (isinstance(value, (int, float)) and math.isfinite(value) and 0 < value <= limit):
+            raise UserError(f'{key} lies in (0, {limit:g}]', value, f'correct {where}')
+    return full
+
+
+def model_card(config: dict, parameters: int, size: int) -> str:
+    """The README of a checkpoint, from the content of its `config.json`."""
+    network = config['network']
+    side, houses = network['size'], config['houses']
+    home = 'its training environment'
+    if houses:
+        home = f'{len(houses)} procedural house{"s" * (len(houses) > 1)} ' + (
+            f'(seed{"s" * (len(houses) > 1)} {", ".join(map(str, houses[:8]))}'
+            f'{", ..." * (len(houses) > 8)}; {config["rooms"]} rooms each)')
+    facts = {
+        'Input': f'RGB {side} x {side} from a camera {config["camera_height"]:g} m above the '
+                 f'floor, {config["camera_fov_deg"]:g} deg field of view; the goal picture alike',
+        'Actions': ', '.join(config['action_names']),
+        'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
+            config['decoding']],
+        'Network': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and goal '
+                   f'fused in the first; {network["features"]} features; LSTM '
+                   f'{network["hidden"]}; {parameters:,} parameters, {size / 1e6:.1f} MB',
+        'Trained in': home,
+        'Training': f'{config["frames"]:,} frames (agent decisions) in {config["minutes"]:.1f} '
+                    f'minutes, seed {config["seed"]}',
+        'World version': config['world_version'],
+        'Weights': f'SHA-256 `{config["sha256"]}`',
+    }
+    lines = ['# Visual navigation policy', '',
+             'Drives a robot to the place where a picture was taken. It sees its camera, the goal '
+             'picture and its own last action; no map, no depth, no pose.', '',
+             '| | |', '|---|---|', *(f'| {key} | {value} |' for key, value in facts.items())]
+    if config['command']:
+        lines += ['', 'Trained with', '', '```', str(config['command']), '```']
+    lines += ['', '## Measured', '']
+    lines += _results_table(config['results']) or ['Nothing yet.']
+    if config['notes']:
+        lines += ['', '## Notes', '', str(config['notes'])]
     return '\n'.join(lines) + '\n'
 
 
-def results_table(results: dict) -> str:
-    """Markdown of {control: summary} as `vn_nav evaluate` measures them."""
-    rows = ['| policy | episodes | success (95 %) | SPL | decisions | seconds | '
-            'collisions | contact-free success | stop error | return |',
-            '|---|---|---|---|---|---|---|---|---|---|']
-    for control, r in results.items():
-        low, high = r['success_interval']
-        rows.append(
-            f'| {control} | {r["episodes"]} | {r["success"]:.2f} ({low:.2f}-{high:.2f}) | '
-            f'{r["spl"]:.2f} | {r["decisions"]:.0f} | {r["seconds"]:.0f} | '
-            f'{r["collisions"]:.3f} | {r["contact_free_success"]:.2f} | '
-            f'{r["stop_error_m"]:.2f} m, {r["stop_error_deg"]:.0f} deg | {r["return"]:.2f} |')
-    return '\n'.join(rows)
+def _results_table(results: dict) -> list[str]:
+    """One row for each nested mapping, its figures as columns; other values as a list."""
+    rows = {name: row for name, row in results.items() if isinstance(row, dict)}
+    lines = []
+    if rows:
+        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+        lines += ['| | ' + ' | '.join(key.replace('_', ' ') for key in columns) + ' |',
+                  '|---' * (len(columns) + 1) + '|']
+        lines += [f'| {name.replace("_", " ")} | '
+                  + ' | '.join(_figure(row.get(key, '')) for key in columns) + ' |'
+                  for name, row in rows.items()]
+    single = [f'- {name.replace("_", " ")}: {_figure(value)}' for name, value in results.items()
+              if name not in rows]
+    return lines + ([''] if rows and single else []) + single
+
+
+def _figure(value: object) -> str:
+    if isinstance(value, float):
+        return f'{value:.3g}' if abs(value) < 1000 else f'{value:,.0f}'
+    if isinstance(value, (list, tuple)):
+        return ' to '.join(_figure(part) for part in value)
+    return str(value)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file that appears, or is replaced, whole or not at all, and survives a crash."""
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    try:
+        with open(temporary, 'wb') as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    _sync_folder(path.parent)
+
+
+def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
+    """Write a folder that appears, or is replaced, whole or not at all."""
+    folder = folder.absolute()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if folder.exists() and any(path.name not in (WEIGHTS, CONFIG, CARD)
+                               for path in folder.iterdir()):
+        raise UserError('only a checkpoint folder is replaced by a checkpoint', str(folder),
+                        'choose another folder')
+    temporary = folder.with_name(f'.{folder.name}.{os.getpid()}.tmp')
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    try:
+        for name, data in files.items():
+            write_file(temporary / name, data)
+        if folder.exists():
+            _exchange(temporary, folder)
+        else:
+            temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    _sync_folder(folder.parent)
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Swap two folders of one file system, atomically where the kernel can (Linux)."""
+    exchange, here = 2, -100  # RENAME_EXCHANGE, AT_FDCWD
+    try:
+        swapped = ctypes.CDLL(None).renameat2(here, os.fsencode(one), here, os.fsencode(other),
+                                              exchange) == 0
+    except AttributeError:
+        swapped = False
+    if not swapped:
+        aside = one.with_name(one.name + '.old')
+        other.rename(aside)
+        one.rename(other)
+        aside.rename(one)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

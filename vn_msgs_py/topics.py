@@ -1,0 +1,84 @@
+"""The topic contract: one table for nodes, bags and documentation. Names are relative."""
+
+from __future__ import annotations
+
+import dataclasses
+
+RELIABLE, BEST_EFFORT = 'reliable', 'best_effort'
+VOLATILE, LATCHED = 'volatile', 'transient_local'
+
+
+@dataclasses.dataclass(frozen=True)
+class Topic:
+    """One topic. Quality of service as in REP 2003: sensors best effort, latched facts reliable."""
+
+    name: str
+    type: str
+    publisher: str  # robot (or the bridge in its place), bridge, policy, user
+    meaning: str
+    reliability: str = RELIABLE
+    durability: str = VOLATILE
+    depth: int = 10
+
+
+def _sensor(name, kind, publisher, meaning):
+    return Topic(name, kind, publisher, meaning, BEST_EFFORT, VOLATILE, 1)
+
+
+def _latched(name, kind, publisher, meaning):
+    return Topic(name, kind, publisher, meaning, RELIABLE, LATCHED, 1)
+
+
+_IMAGE, _STRING = 'sensor_msgs/msg/Image', 'std_msgs/msg/String'
+
+TOPICS = (
+    _sensor('image_raw', _IMAGE, 'robot', 'camera picture, any encoding of vn_msgs_py.images'),
+    _sensor('image_raw/compressed', 'sensor_msgs/msg/CompressedImage', 'robot',
+            'camera picture as JPEG or PNG (image_transport: compressed)'),
+    _sensor('camera_info', 'sensor_msgs/msg/CameraInfo', 'robot', 'focal length of the camera'),
+    _latched('goal_image', _IMAGE, 'user',
+             'where to go; a new header stamp begins a new episode'),
+    Topic('cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
+          'velocity command; TwistStamped with enable_stamped_cmd_vel', depth=1),
+    Topic('odom', 'nav_msgs/msg/Odometry', 'robot', 'wheel odometry; actions are closed on it'),
+    Topic('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
+    _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),
+    Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy', 'state and reasons'),
+    _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),
+    _sensor('labels/image_raw', _IMAGE, 'bridge', 'mono8 class ids'),
+    _latched('labels/names', _STRING, 'bridge', 'JSON list: the names behind the class ids'),
+    Topic('collision', 'std_msgs/msg/Bool', 'bridge', 'at a decision\'s end: it touched something'),
+    Topic('reward', 'std_msgs/msg/Float32', 'bridge', 'at a decision\'s end: 1 on arrival, else 0'),
+    Topic('episode_end', 'std_msgs/msg/UInt8', 'bridge', '1 terminated, 2 truncated'),
+    Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
+          'true pose in the map, for evaluation; the policy never reads it'),
+    _latched('scene', _STRING, 'bridge', 'JSON: house, rooms, goals, limits, world version'),
+    _latched('episode', _STRING, 'bridge', 'JSON: goal and start of the present episode'),
+    Topic('episode_result', _STRING, 'bridge', 'JSON: outcome of the episode that ended'),
+    Topic('goal_pose', 'geometry_msgs/msg/PoseStamped', 'user',
+          'a goal by pose; taken by the bridge\'s ~/reset', depth=1),
+    _sensor('/clock', 'rosgraph_msgs/msg/Clock', 'bridge', 'simulated time'),
+)
+
+
+def topic(name: str) -> Topic:
+    """The topic of a name.
+
+    Raises:
+        KeyError: a name that is not in the contract.
+    """
+    for entry in TOPICS:
+        if entry.name == name:
+            return entry
+    raise KeyError(f'the topic is one of the contract; received {name!r}; see vn_msgs_py.topics')
+
+
+def markdown_table() -> str:
+    """The contract as the table of the README."""
+    rows = ['| topic | type | QoS | from | meaning |', '|---|---|---|---|---|']
+    for t in TOPICS:
+        qos = f'{t.reliability.replace("_", " ")}' + (', latched' if t.durability == LATCHED
+                                                      else '') + f', {t.depth}'
+        rows.append(f'| `{t.name}` | `{t.type.replace("/msg/", "/")}` | {qos} | {t.publisher} | '
+                    f'{t.meaning} |')
+    return '\n'.join(rows)

@@ -1,0 +1,1 @@
+"""Recorded drives: rosbag2 bags in MCAP, written and read without a ROS installation."""

@@ -1,0 +1,23 @@
+"""Quality of service of every topic, from the contract in `vn_msgs_py.topics`."""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from vn_msgs_py.topics import BEST_EFFORT, LATCHED, topic
+
+
+def qos(name: str, *, depth: int | None = None) -> QoSProfile:
+    """The profile of a topic of the contract.
+
+    Args:
+        name: relative name as in the contract.
+        depth: another queue length, for a recorder that must not lose pictures.
+    """
+    entry = topic(name)
+    return QoSProfile(
+        depth=depth or entry.depth,
+        reliability=(ReliabilityPolicy.BEST_EFFORT if entry.reliability == BEST_EFFORT
+                     else ReliabilityPolicy.RELIABLE),
+        durability=(DurabilityPolicy.TRANSIENT_LOCAL if entry.durability == LATCHED
+                    else DurabilityPolicy.VOLATILE))
