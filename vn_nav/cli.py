@@ -44,7 +44,13 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument('--progress-reward', type=float, default=1.0, help='per metre')
     train.add_argument('--collision-reward', type=float, default=-0.02, help='per contact')
     train.add_argument('--learning-rate', type=float, default=4e-4)
+    train.add_argument('--entropy', type=float, default=0.008, help='weight of the entropy')
+    train.add_argument('--rollout-length', type=int, default=32)
     train.add_argument('--epochs', type=int, default=2)
+    train.add_argument('--minibatches', type=int, default=4)
+    train.add_argument('--channels', type=int, nargs=3, default=(16, 32, 64),
+                       help='of the three convolutions')
+    train.add_argument('--no-tensorboard', action='store_true')
     train.add_argument('--no-bf16', action='store_true', help='float32 throughout')
     train.add_argument('--threads', type=int, default=1)
     train.set_defaults(run=run_train)
@@ -92,24 +98,27 @@ def make_env(houses, rooms: int, envs: int, threads: int = 1, **options):
 def run_train(args) -> int:
     """`vn_nav train`."""
     _check_backend(args.backend)
-    from vn_nav.learning.learner import LearnerConfig
     from vn_nav.learning.trainer import TrainConfig, train
     houses = args.house or [0]
     env = make_env(houses, args.rooms, args.envs, args.threads, size=args.size, seed=args.seed,
                    progress_reward=args.progress_reward, collision_reward=args.collision_reward)
-    learner = LearnerConfig(learning_rate=args.learning_rate, epochs=args.epochs,
-                            bf16=not args.no_bf16)
-    config = TrainConfig(frames=int(args.frames), seed=args.seed, minutes=args.minutes,
-                         threads=args.threads, learner=learner)
+    config = TrainConfig(
+        frames=int(args.frames), minutes=args.minutes, rollout_length=args.rollout_length,
+        epochs=args.epochs, minibatches=args.minibatches, channels=tuple(args.channels),
+        learning_rate=args.learning_rate, final_learning_rate=args.learning_rate / 10,
+        entropy_coefficient=args.entropy, final_entropy_coefficient=args.entropy / 3,
+        seed=args.seed, bf16=False if args.no_bf16 else None, threads=args.threads,
+        tensorboard=not args.no_tensorboard)
     words = [word for word in sys.argv[1:] if word != '--resume']
     info = {
-        'world_version': env.world_version, 'houses': houses, 'rooms': args.rooms,
-        'command': 'vn_nav ' + shlex.join(words), 'machine': machine(),
-        'date': datetime.date.today().isoformat(),
+        'houses': houses, 'rooms': args.rooms, 'command': 'vn_nav ' + shlex.join(words),
         'camera_fov_deg': math.degrees(env.robot.camera_fov),
         'camera_height': env.robot.camera_height,
+        'notes': f'Trained on {machine()}, {args.threads} thread(s), '
+                 f'{datetime.date.today().isoformat()}.',
+        'world_version': env.world_version,
     }
-    print(train(env, config, args.out, info, resume=args.resume))
+    print(train(env, config, args.out, info=info, resume=args.resume))
     return 0
 
 
@@ -128,8 +137,12 @@ def _load(path: Path):
     from vn_nav.policy.checkpoint import load_checkpoint
     from vn_nav.robot import RobotSpec
     from vn_sim_bridge.world import WORLD_VERSION
-    checkpoint = load_checkpoint(path, expect_world=WORLD_VERSION)
+    checkpoint = load_checkpoint(path)
     RobotSpec().with_actions(checkpoint.config.actions)  # or says which action is unknown
+    if checkpoint.info['world_version'] != WORLD_VERSION:
+        raise UserError(f'the checkpoint belongs to world version {WORLD_VERSION!r}',
+                        checkpoint.info['world_version'], 'train it again (vn_nav train), or use '
+                        'the version of vn_nav that it came with')
     return checkpoint
 
 
@@ -183,19 +196,20 @@ def run_publish(args) -> int:
     """`vn_nav publish`."""
     from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
     checkpoint = _load(args.source)
-    info = {key: value for key, value in checkpoint.info.items()
-            if key not in ('sha256', 'format', 'results')}
+    info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
     save_checkpoint(args.target, checkpoint.network, info, half=True)
     shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
     houses, rooms = info['houses'], info['rooms']
-    places = {f'Trained house (seed {", ".join(map(str, houses))}), 300 decisions': houses,
-              f'A house it never saw (seed {args.unseen}), 300 decisions': [args.unseen]}
     info['results'] = {}
-    for place, seeds in places.items():
-        info['results'][place] = measure(shipped, seeds, rooms, episodes=args.episodes,
-                                         seed=10_000)
-        show_results(info['results'][place], place)
-    info['unseen_house'] = args.unseen
+    for place, seeds in (('trained house', houses), (f'unseen house {args.unseen}',
+                                                     [args.unseen])):
+        results = measure(shipped, seeds, rooms, episodes=args.episodes, seed=10_000)
+        show_results(results, place)
+        info['results'] |= {f'{place}: {name}': figures for name, figures in results.items()}
+    info['notes'] += (f' Measured with `vn_nav publish`, {args.episodes} episodes a row, 300 '
+                      f'decisions at most, motion noise on, on {machine()}, '
+                      f'{datetime.date.today().isoformat()}. Figures are defined in '
+                      'docs/architecture.md.')
     save_checkpoint(args.target, shipped.network, info, half=True)
     return 0
 

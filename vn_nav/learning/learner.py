@@ -137,7 +137,8 @@ def select(observation: Observation, columns: Tensor) -> Observation:
     """
     image = observation.image[:-1].permute(0, 1, 3, 4, 2)[:, columns].permute(0, 1, 4, 2, 3)
     used, index = torch.unique(observation.goal_index[:-1, columns], return_inverse=True)
-    return Observation(image, observation.goals[used], index, observation.last_action[:-1, columns],
+    return Observation(image, observation.goals[used], index,
+                       observation.last_action[:-1, columns],
                        observation.last_reward[:-1, columns])
 
 

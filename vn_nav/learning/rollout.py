@@ -1,7 +1,7 @@
 """The batch that learning consumes, and how it is collected from an environment.
 
-Time under NEXT_STEP autoreset, for an episode that ends with the action of row t: row t+1 shows its
-true last observation, whose value bootstraps a truncated episode; the environment ignores the
+Time under NEXT_STEP autoreset, for an episode that ends with the action of row t: row t+1 shows
+its true last observation, whose value bootstraps a truncated episode; the environment ignores the
 action of that row, so it is no frame (`valid` is False). Row t+2 begins the next episode
 (`starts`).
 """

@@ -25,7 +25,8 @@ from vn_nav.learning.rollout import Collector, Episode
 from vn_nav.policy.checkpoint import save_checkpoint, write_file
 from vn_nav.policy.network import NetworkConfig, Policy
 
-CHECKPOINT, STATE, METRICS, TENSORBOARD = 'checkpoint', 'training_state', 'metrics.csv', 'tensorboard'
+CHECKPOINT, STATE = 'checkpoint', 'training_state'
+METRICS, TENSORBOARD = 'metrics.csv', 'tensorboard'
 COLUMNS = ('frames', 'minutes', 'fps', 'tau', 'success', 'return', 'length', 'collisions',
            'policy_loss', 'value_loss', 'entropy', 'kl', 'clipped', 'gradient_norm',
            'collect_seconds', 'update_seconds')
@@ -338,7 +339,8 @@ class _Log:
         line = (f'{row["frames"]:,} frames · {row["minutes"]:.1f} min · {row["fps"]:,.0f} fps · '
                 f'tau {row["tau"]:.2f} · success {row["success"]:.2f} · '
                 f'length {row["length"]:.0f} · collisions {row["collisions"]:.2f} · '
-                f'entropy {row["entropy"]:.2f} · kl {row["kl"]:.4f} · value {row["value_loss"]:.3f}')
+                f'entropy {row["entropy"]:.2f} · kl {row["kl"]:.4f} · '
+                f'value {row["value_loss"]:.3f}')
         if self.bar is not None:
             self.bar.update(self.task, completed=share, description=line)
         elif time.monotonic() - self.printed >= 10 or share >= 1:

@@ -51,7 +51,8 @@ class LoadedCheckpoint:
     info: dict  # the keys of `INFO`, and 'sha256' of the weights
 
 
-def save_checkpoint(folder: str | Path, network: Policy, info: dict, *, half: bool = False) -> None:
+def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
+                    half: bool = False) -> None:
     """Write a checkpoint; the folder appears, or is replaced, whole or not at all.
 
     Args:
@@ -123,7 +124,8 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
     missing = own - config.keys()
     if missing:
         raise UserError(f'{CONFIG} has the keys {", ".join(sorted(own))}',
-                        f'{where} without {", ".join(sorted(missing))}', 'get the checkpoint again')
+                        f'{where} without {", ".join(sorted(missing))}',
+                        'get the checkpoint again')
     info = _check_info({key: value for key, value in config.items() if key not in own}, where)
     weights = (folder / WEIGHTS).read_bytes()
     digest = hashlib.sha256(weights).hexdigest()
@@ -134,8 +136,8 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
         network_config = NetworkConfig(actions=tuple(config['action_names']), **config['network'])
     except TypeError as error:
         known = ', '.join(field.name for field in dataclasses.fields(NetworkConfig))
-        raise UserError(f'the network in {CONFIG} has only the fields {known}', f'{where}: {error}',
-                        'use the version of vn_nav that wrote it, or train again') from error
+        raise UserError(f'the network in {CONFIG} has only the fields {known}',
+                        f'{where}: {error}', 'use the version of vn_nav that wrote it, or train again') from error
     if expect_actions is not None and tuple(expect_actions) != network_config.actions:
         raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
                         ', '.join(network_config.actions), 'use a checkpoint trained for them')

@@ -78,9 +78,9 @@ class PolicyOutput(NamedTuple):
 class Policy(nn.Module):
     """Early fusion of picture and goal, at the price of late fusion.
 
-    The first convolution of a six-channel stack (picture above goal) is a sum of two three-channel
-    convolutions. So the goal's half runs once for each distinct goal (`encode_goals`), not once for
-    each frame, with the same result.
+    The first convolution of a six-channel stack (picture above goal) is a sum of two
+    three-channel convolutions. So the goal's half runs once for each distinct goal
+    (`encode_goals`), not once for each frame, with the same result.
 
     Attributes:
         compute_dtype: type of the convolutions and matrix products; parameters, LSTM state and
@@ -134,8 +134,9 @@ class Policy(nn.Module):
         """Features [N,F] of pictures [N,3,S,S] uint8 beside goals `goal_maps`[goal_index]."""
         dtype = self.compute_dtype
         maps = self._first(image, self.picture_conv)
-        # Adding goal_maps[goal_index] as a product with the one-hot matrix [N,G]: one pass forward,
-        # and backward one product in place of a slow scatter over the frames that share a goal.
+        # Adding goal_maps[goal_index] as a product with the one-hot matrix [N,G]: one pass
+        # forward, and backward one product in place of a slow scatter over the frames that share
+        # a goal.
         rows, goal_rows = maps.permute(0, 2, 3, 1), goal_maps.permute(0, 2, 3, 1)
         one_hot = (goal_index.unsqueeze(1) == torch.arange(len(goal_maps))).to(dtype)
         fused = F.relu(torch.addmm(rows.flatten(1), one_hot, goal_rows.flatten(1)))

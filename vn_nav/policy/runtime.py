@@ -77,7 +77,7 @@ class PolicyRuntime:
         """The next action for a picture, uint8 [3,S,S]; remembered as the last action.
 
         Raises:
-            FloatingPointError: the logits are not finite. Memory and last action stay as they were.
+            FloatingPointError: the logits are not finite; memory and last action stay.
             UserError: no goal yet, or a picture of another shape or type.
         """
         if self._goal_maps is None:

@@ -1,0 +1,523 @@
+"""`policy_node`: camera and goal picture in, Twist out. A lifecycle node.
+
+Threads: the executor keeps the newest frame; one worker decodes and infers; one output thread on
+the steady clock alone owns the command publisher, the watchdog and the ramps.
+
+Run: `ros2 run vn_nav policy_node --ros-args -p checkpoint:=models/house`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import sys
+import threading
+import time
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Int8, String
+from std_srvs.srv import SetBool, Trigger
+
+from vn_msgs_py import images, motion
+from vn_nav.errors import UserError
+from vn_nav.nodes.qos import qos
+from vn_nav.observation import crop_fraction, preprocess
+from vn_nav.policy.navigator import Limits, Navigator, State
+from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.resources import share_file
+from vn_nav.robot import RobotSpec, load_robot
+
+LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step
+
+# name: (default, meaning, range or None). Ranges are [least, most] in the parameter's unit.
+PARAMETERS = {
+    'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),
+    'robot': ('', 'YAML file of the robot; empty: the standard robot', None),
+    'mode': ('stop_and_go', 'stop_and_go, or continuous: a decision at every frame', None),
+    'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step', None),
+    'image_transport': ('raw', 'raw, or compressed: image_raw/compressed', None),
+    'enable_stamped_cmd_vel': (False, 'publish TwistStamped instead of Twist', None),
+    'autostart': (True, 'configure and activate at the start', None),
+    'auto_enable': (False, 'enable motion as soon as it is possible (simulators only)', None),
+    'seed': (0, 'of the sampled actions', None),
+    'decoding': ('', 'sample or greedy; empty: as the checkpoint was measured', None),
+    'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
+    'frame_timeout': (0.25, 'camera silence after which the robot stands still [s]', (0.05, 5.0)),
+    'frame_stop_timeout': (1.0, 'camera silence that latches a stop [s]', (0.1, 10.0)),
+    'max_frame_age': (0.25, 'older frames are dropped [s]', (0.02, 5.0)),
+    'max_frame_ahead': (0.05, 'frames stamped later than now are dropped [s]', (0.0, 5.0)),
+    'inference_timeout': (0.1, 'later decisions are discarded [s]', (0.005, 2.0)),
+    'settle_time': (0.1, 'from a motion\'s last command to a frame at rest [s]', (0.0, 2.0)),
+}
+
+
+def _seconds(stamp) -> float:
+    return stamp.sec + stamp.nanosec * 1e-9
+
+
+class PolicyNode(LifecycleNode):
+    """See the module's docstring; what it does in which state is `vn_nav.policy.navigator`."""
+
+    def __init__(self):
+        super().__init__('policy_node')
+        for name, (default, meaning, span) in PARAMETERS.items():
+            ranges = [FloatingPointRange(from_value=span[0], to_value=span[1])] if span else []
+            self.declare_parameter(name, default, ParameterDescriptor(
+                description=meaning, floating_point_range=ranges))
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._wake = threading.Condition()  # guards everything below, and wakes both threads
+        self.navigator: Navigator | None = None
+        self._running = False
+        self._threads: list[threading.Thread] = []
+        self._interfaces: list = []
+        self._new_frame = self._new_goal = None
+        self._camera_fov: float | None = None
+        self._odometry: np.ndarray | None = None
+        self._odometry_stamp = 0.0
+        self._odometry_received = -math.inf
+        self._odometry_count = 0
+        self._last_diagnosis: tuple | None = None
+        self.failure = ''
+
+    def _on_parameters(self, parameters) -> SetParametersResult:
+        """Operation is fixed while active: a limit must not move under a moving robot."""
+        for parameter in parameters:
+            if parameter.name in PARAMETERS and self._running:
+                return SetParametersResult(successful=False, reason=(
+                    f'{parameter.name} is fixed while the node is active; received '
+                    f'{parameter.value!r}; deactivate first'))
+            if isinstance(parameter.value, float) and not math.isfinite(parameter.value):
+                return SetParametersResult(successful=False, reason=(
+                    f'{parameter.name} is finite; received {parameter.value}'))
+        return SetParametersResult(successful=True)
+
+    # Lifecycle.
+
+    def on_configure(self, _state) -> TransitionCallbackReturn:
+        """Load robot and checkpoint; nothing is published when that fails."""
+        try:
+            self._configure()
+        except UserError as error:
+            self.failure = str(error)
+            self.get_logger().error(self.failure)
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _configure(self) -> None:
+        value = {name: self.get_parameter(name).value for name in PARAMETERS}
+        for name, allowed in (('mode', ('stop_and_go', 'continuous')),
+                              ('time', ('real_time', 'lock_step')),
+                              ('image_transport', ('raw', 'compressed')),
+                              ('decoding', ('', 'sample', 'greedy'))):
+            if value[name] not in allowed:
+                raise UserError(f'{name} is one of {", ".join(a or "(empty)" for a in allowed)}',
+                                value[name], f'set it with -p {name}:=...')
+        self.lock_step = value['time'] == 'lock_step'
+        self.auto_enable = value['auto_enable']
+        robot = load_robot(value['robot']) if value['robot'] else RobotSpec()
+        self.runtime = PolicyRuntime(value['checkpoint'] or share_file('models/house'),
+                                     seed=value['seed'], decoding=value['decoding'] or None)
+        robot = robot.with_actions(self.runtime.action_names)
+        if self.lock_step:
+            limits = Limits(frame_timeout=LOCK_STEP_LIMIT, frame_stop_timeout=LOCK_STEP_LIMIT,
+                            inference_timeout=LOCK_STEP_LIMIT, settle_time=0.0)
+        else:
+            limits = Limits(**{name: value[name] for name in Limits.__dataclass_fields__})
+        self.period = 1.0 / value['control_rate']
+        self.navigator = Navigator(robot, limits, continuous=value['mode'] == 'continuous',
+                                   exact=self.lock_step)
+        self.stamped = value['enable_stamped_cmd_vel']
+        self._make_interfaces(value['image_transport'] == 'compressed')
+
+    def _make_interfaces(self, compressed: bool) -> None:
+        kind = TwistStamped if self.stamped else Twist
+        self._command = self.create_publisher(kind, 'cmd_vel', qos('cmd_vel'))
+        self._action = self.create_publisher(Int8, 'action', qos('action'))
+        self._action_names = self.create_publisher(String, 'action_names', qos('action_names'))
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics',
+                                                  qos('/diagnostics'))
+        image = 'image_raw/compressed' if compressed else 'image_raw'
+        self._interfaces = [
+            (self.destroy_subscription, self.create_subscription(
+                CompressedImage if compressed else Image, image, self._on_image, qos(image))),
+            (self.destroy_subscription, self.create_subscription(
+                CameraInfo, 'camera_info', self._on_camera_info, qos('camera_info'))),
+            (self.destroy_subscription, self.create_subscription(
+                Image, 'goal_image', self._on_goal, qos('goal_image'))),
+            (self.destroy_subscription, self.create_subscription(
+                Odometry, 'odom', self._on_odometry, qos('odom'))),
+            (self.destroy_service, self.create_service(SetBool, '~/enable', self._on_enable)),
+            (self.destroy_service, self.create_service(Trigger, '~/stop', self._on_stop)),
+            (self.destroy_service, self.create_service(Trigger, '~/reset', self._on_reset)),
+            (self.destroy_timer, self.create_timer(0.25, self._on_timer, clock=self._steady)),
+            *((self.destroy_publisher, publisher) for publisher in (
+                self._command, self._action, self._action_names, self._diagnostics)),
+        ]
+        self._action_names.publish(String(data=json.dumps(list(self.runtime.action_names))))
+
+    def on_activate(self, state) -> TransitionCallbackReturn:
+        """Start looking; motion needs ~/enable."""
+        others = self._other_publishers()
+        if others:
+            self.failure = (f'this node alone publishes its command topic; received {others} more '
+                            'publisher(s) on cmd_vel; remap one of them (twist_mux combines them)')
+            self.get_logger().error(self.failure)
+            return TransitionCallbackReturn.FAILURE
+        self._running = True
+        self._threads = [threading.Thread(target=self._guard, args=(loop,), name=loop.__name__,
+                                          daemon=True) for loop in (self._infer, self._output)]
+        for thread in self._threads:
+            thread.start()
+        return super().on_activate(state)
+
+    def on_deactivate(self, state) -> TransitionCallbackReturn:
+        """Zero first, then silence."""
+        self.halt('deactivated')
+        with self._wake:
+            self.navigator.reset()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, _state) -> TransitionCallbackReturn:
+        """Let go of everything that on_configure made."""
+        for destroy, interface in self._interfaces:
+            destroy(interface)
+        self._interfaces = []
+        self._new_frame = self._new_goal = self._odometry = None
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, _state) -> TransitionCallbackReturn:
+        """As deactivation, from any state."""
+        self.halt('shut down')
+        return TransitionCallbackReturn.SUCCESS
+
+    def halt(self, reason: str) -> None:
+        """End both threads with a zero command that has been delivered (200 ms at most)."""
+        with self._wake:
+            if not self._running:
+                return
+            self.navigator.stop(reason, time.monotonic())
+            self._running = False
+            self._wake.notify_all()
+        for thread in self._threads:
+            thread.join(timeout=1.0)
+        self._send(np.zeros(4))  # the output thread is gone: still only one owner
+        self._command.wait_for_all_acked(Duration(seconds=0.2))
+
+    def _guard(self, loop) -> None:
+        """A failing thread stops the robot; it never dies silently."""
+        try:
+            loop()
+        except Exception as error:  # whatever it was: zero first
+            with self._wake:
+                self.navigator.stop(f'{loop.__name__.strip("_")} failed: {error!r}',
+                                    time.monotonic())
+            for _ in range(20):
+                self._send(np.zeros(4))
+                time.sleep(0.05)
+            raise
+
+    # Callbacks, on the executor's thread. They keep the newest message and return.
+
+    def _on_image(self, message) -> None:
+        stamp = _seconds(message.header.stamp)
+        with self._wake:
+            # In lock-step stamps are the simulator's ticks and nothing is late; elsewhere the
+            # node's clock judges.
+            clock = None if self.lock_step else self.get_clock().now().nanoseconds * 1e-9
+            if self.navigator.admit(stamp, clock):
+                self._new_frame = (message, stamp)
+                self._wake.notify_all()
+
+    def _on_goal(self, message: Image) -> None:
+        identity = (message.header.stamp.sec, message.header.stamp.nanosec)
+        with self._wake:
+            if self.navigator.new_goal(identity):
+                self._new_goal = message
+                self._wake.notify_all()
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        side, focal = min(message.width, message.height), message.k[0]
+        if side > 0 and math.isfinite(focal) and focal > 0:
+            self._camera_fov = 2 * math.atan(side / 2 / focal)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        with self._wake:
+            try:
+                values = motion.odometry_to_array(message)
+            except motion.MotionError as error:
+                self.navigator.stop(f'bad odometry: {error}', time.monotonic())
+                return
+            if self.lock_step and values[6] < self._odometry_stamp:
+                self.navigator.time_jumped()
+            self._odometry, self._odometry_stamp = values[:3], values[6]
+            self._odometry_received = time.monotonic()
+            self._odometry_count += 1
+            self._wake.notify_all()
+
+    def _on_enable(self, request, response):
+        with self._wake:
+            if request.data:
+                response.success, response.message = self._enable()
+            else:
+                self.navigator.disable()
+                response.success, response.message = True, 'disabled'
+            self._wake.notify_all()
+        self._diagnose()
+        return response
+
+    def _enable(self) -> tuple[bool, str]:
+        blockers = []
+        if not self._running:
+            blockers.append('the node is not active: activate it first')
+        if others := self._other_publishers():
+            blockers.append(f'{others} other publisher(s) on cmd_vel: remap one')
+        try:
+            self._fov_check()
+        except UserError as error:
+            blockers.append(str(error))
+        return self.navigator.enable(time.monotonic(), tuple(blockers))
+
+    def _fov_check(self) -> None:
+        if self._camera_fov is not None:
+            crop_fraction(self._camera_fov, self.runtime.camera_fov)
+
+    def _on_stop(self, _request, response):
+        with self._wake:
+            self.navigator.stop('~/stop was called', time.monotonic())
+            self._wake.notify_all()
+        response.success, response.message = True, 'stopped: ~/reset, then ~/enable to go on'
+        return response
+
+    def _on_reset(self, _request, response):
+        with self._wake:
+            self.navigator.reset()
+        response.success, response.message = True, 'ready: ~/enable to go on'
+        return response
+
+    def _on_timer(self) -> None:
+        """Four times a second: intruders on the command topic, self-enabling, diagnostics."""
+        with self._wake:
+            if self._running:
+                others = self._other_publishers()
+                if others and self.navigator.state in (State.RUNNING, State.HOLD):
+                    self.navigator.stop(f'{others} other publisher(s) on cmd_vel',
+                                        time.monotonic())
+                elif self.auto_enable and self.navigator.state is State.IDLE:
+                    self._enable()
+                self._wake.notify_all()
+        self._diagnose()
+
+    def _other_publishers(self) -> int:
+        return max(0, self.count_publishers(self._command.topic_name) - 1)
+
+    def _diagnose(self) -> None:
+        """Publish the state once a second, and at once when it changes."""
+        if self.navigator is None or not self._interfaces:
+            return
+        with self._wake:
+            state, reason = self.navigator.state, self.navigator.reason
+            decisions, dropped = self.navigator.decisions, dict(self.navigator.dropped)
+        now = time.monotonic()
+        if self._last_diagnosis and self._last_diagnosis[:2] == (state, reason) and (
+                now - self._last_diagnosis[2] < 0.95):
+            return
+        if state is State.STOPPED and (not self._last_diagnosis
+                                       or self._last_diagnosis[:2] != (state, reason)):
+            self.get_logger().error(f'stopped: {reason}; ~/reset, then ~/enable to go on')
+        self._last_diagnosis = (state, reason, now)
+        level = {State.STOPPED: DiagnosticStatus.ERROR, State.HOLD: DiagnosticStatus.WARN}.get(
+            state, DiagnosticStatus.OK)
+        values = {'state': state.value, 'reason': reason, 'decisions': decisions,
+                  'camera_fov_deg': round(math.degrees(self._camera_fov), 1)
+                  if self._camera_fov else 'unknown',
+                  'listeners_on_cmd_vel': self._command.get_subscription_count(),
+                  **{f'dropped: {why}': count for why, count in dropped.items()}}
+        mismatch = self._mismatched_listeners()
+        if mismatch:
+            values['cmd_vel'] = mismatch
+            level = DiagnosticStatus.ERROR
+        status = DiagnosticStatus(
+            level=level, name=self.get_fully_qualified_name(), hardware_id=self.navigator.robot.name,
+            message=mismatch or f'{state.value}: {reason}' if reason or mismatch else state.value,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _mismatched_listeners(self) -> str:
+        """Twist meets TwistStamped: the robot would stand still without a word."""
+        mine = 'geometry_msgs/msg/' + ('TwistStamped' if self.stamped else 'Twist')
+        for info in self.get_subscriptions_info_by_topic(self._command.topic_name):
+            if info.topic_type != mine:
+                return (f'{info.node_name} listens for {info.topic_type} where this node sends '
+                        f'{mine}: set enable_stamped_cmd_vel to {not self.stamped}')
+        return ''
+
+    # The worker: decodes every admitted frame, and infers when a decision is wanted.
+
+    def _infer(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: not self._running or self._new_frame or self._new_goal)
+                if not self._running:
+                    return
+                goal, self._new_goal = self._new_goal, None
+                frame, self._new_frame = self._new_frame, None
+            if goal is not None:
+                self._take_goal(goal)
+            if frame is not None:
+                self._take_frame(*frame)
+
+    def _take_goal(self, message: Image) -> None:
+        try:
+            # A goal picture comes from a camera like this one; it is cropped the same way.
+            picture = self._prepare(message)
+        except (images.ImageError, UserError) as error:
+            self.get_logger().error(f'goal_image refused: {error}')
+            with self._wake:
+                self.navigator.refuse_goal()
+            return
+        self.runtime.set_goal(picture)
+        with self._wake:
+            if self._new_goal is None:  # else a newer one is waiting
+                stamp = _seconds(message.header.stamp) if self.lock_step else -math.inf
+                self.navigator.accept_goal(stamp)
+
+    def _take_frame(self, message, stamp: float) -> None:
+        try:
+            picture = self._prepare(message)
+        except (images.ImageError, UserError) as error:
+            with self._wake:
+                self.navigator.bad_frame(str(error), time.monotonic())
+            return
+        with self._wake:
+            now = time.monotonic()
+            self.navigator.good_frame(now)
+            ticket = self.navigator.request(stamp, now)
+        if ticket is None:
+            return
+        try:
+            action = self.runtime.act(picture)
+        except FloatingPointError as error:
+            with self._wake:
+                self.navigator.stop(str(error), time.monotonic())
+                self._wake.notify_all()
+            return
+        self._action.publish(Int8(data=action))
+        with self._wake:
+            self.navigator.decided(ticket, action, time.monotonic())
+            self._wake.notify_all()
+
+    def _prepare(self, message) -> np.ndarray:
+        fov = {} if self._camera_fov is None else {
+            'fov': self._camera_fov, 'target_fov': self.runtime.camera_fov}
+        return preprocess(images.decode_rgb(message), self.runtime.size, **fov)
+
+    # The output thread: the only one that publishes commands.
+
+    def _output(self) -> None:
+        if self.lock_step:
+            self._output_lock_step()
+        else:
+            self._output_real_time()
+
+    def _output_real_time(self) -> None:
+        due = time.monotonic()
+        while True:
+            due = max(due + self.period, time.monotonic())
+            with self._wake:
+                # A stop does not wait for the next period.
+                self._wake.wait_for(
+                    lambda: not self._running or (self.navigator.state is State.STOPPED
+                                                  and self.navigator.velocity_sent),
+                    timeout=max(0.0, due - time.monotonic()))
+                if not self._running:
+                    return
+                now = time.monotonic()
+                odometry = self._odometry
+                if odometry is not None and now - self._odometry_received > (
+                        self.navigator.limits.frame_timeout):
+                    odometry = None
+                    if self.navigator.executor.action is not None and self._odometry is not None:
+                        self.navigator.stop('odometry fell silent in motion', now)
+                stamp = self.get_clock().now().nanoseconds * 1e-9
+                velocity = self.navigator.step(now, self.period, odometry, stamp)
+                self.navigator.velocity_sent = velocity is not None and bool(velocity.any())
+            if velocity is not None:
+                self._send(velocity)
+
+    def _output_lock_step(self) -> None:
+        """One command for every odometry message; the first of a motion goes out at once."""
+        answered = self._odometry_count
+        moving = False
+        while True:
+            with self._wake:
+                self._wake.wait_for(
+                    lambda: not self._running or self._odometry_count > answered
+                    or (not moving and self.navigator.ready_to_move), timeout=0.5)
+                if not self._running:
+                    return
+                answered = self._odometry_count
+                velocity = self.navigator.step(time.monotonic(), self.period, self._odometry,
+                                               self._odometry_stamp)
+                moving = velocity is not None and bool(velocity.any())
+            if velocity is not None:
+                self._send(velocity)
+
+    def _send(self, velocity: np.ndarray) -> None:
+        if self.stamped:
+            message = TwistStamped()
+            message.header.stamp = self.get_clock().now().to_msg()
+            message.header.frame_id = 'base_link'
+        else:
+            message = Twist()
+        self._command.publish(motion.fill_twist(message, velocity))
+
+
+def main(args=None) -> int:
+    """Entry point: 0 after a signal, 2 and one line on standard error for bad input."""
+    # rclpy's own handlers would close the context before the zero command is out.
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    node = PolicyNode()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        if node.get_parameter('autostart').value:
+            for transition in (node.trigger_configure, node.trigger_activate):
+                if transition() != TransitionCallbackReturn.SUCCESS:
+                    print(f'policy_node: {node.failure}', file=sys.stderr)
+                    return 2
+        while not ended.is_set():
+            try:
+                executor.spin_once(timeout_sec=0.1)
+            except (KeyboardInterrupt, ExternalShutdownException):
+                break
+            except Exception as error:  # a callback failed: stand still, go inactive, say so
+                node.get_logger().error(f'callback failed, going inactive: {error!r}')
+                if node._running:
+                    node.trigger_deactivate()
+    finally:
+        node.halt('the process ends')
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

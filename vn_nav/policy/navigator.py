@@ -1,0 +1,300 @@
+"""The state machine that drives one robot: when to look, when to move, when to stand still.
+
+No torch, no ROS: `policy_node` feeds it frames, goals, odometry and decisions, and asks it for the
+next velocity. Times called `now` are seconds of a steady clock; stamps are the messages'.
+
+States:
+    idle      not enabled: silent.
+    running   enabled: looks, decides, moves.
+    hold      enabled, zero velocity until the cause is gone by itself.
+    stopped   latched: zero for a second, then silent, until `reset` and `enable`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import numpy as np
+
+from vn_nav.policy.motion import ActionExecutor, cruise, ramp
+from vn_nav.robot import RobotSpec
+
+STOP_SECONDS = 1.0  # how long a stop repeats its zero before it falls silent
+ARMING_SECONDS = 1.0  # of healthy frames before `enable` is granted
+
+
+class State(enum.Enum):
+    """See the module's docstring."""
+
+    IDLE = 'idle'
+    RUNNING = 'running'
+    HOLD = 'hold'
+    STOPPED = 'stopped'
+
+
+class Phase(enum.Enum):
+    """Within `running`, stop and go."""
+
+    LOOK = 'look'  # at rest, waiting for a frame and its decision
+    MOVE = 'move'
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Times after which the robot stands still [s]."""
+
+    frame_timeout: float = 0.25  # camera silence: zero
+    frame_stop_timeout: float = 1.0  # camera silence: latched stop
+    max_frame_age: float = 0.25
+    max_frame_ahead: float = 0.05
+    inference_timeout: float = 0.1
+    settle_time: float = 0.1  # after a motion, before a frame shows the robot at rest
+
+
+class Navigator:
+    """Drives one robot.
+
+    Args:
+        robot: with the policy's actions, in its order.
+        limits: see `Limits`.
+        continuous: decide at every frame and hold the action's velocity in between.
+        exact: lock-step simulation: actions end within micrometres and frames carry exact stamps.
+    """
+
+    def __init__(self, robot: RobotSpec, limits: Limits, *, continuous: bool = False,
+                 exact: bool = False):
+        self.robot, self.limits, self.continuous = robot, limits, continuous
+        self.executor = (ActionExecutor(robot, tolerance=1e-6, creep=0.0) if exact
+                         else ActionExecutor(robot, tolerance=0.004, creep=0.02))
+        self.state, self.reason = State.IDLE, 'not enabled'
+        self.phase = Phase.LOOK
+        self.goal_identity: object = None
+        self.goal_ready = False
+        self.velocity = np.zeros(4)
+        self.velocity_sent = False  # the last command moved the robot
+        self.decisions = 0  # in this episode
+        self.dropped: dict[str, int] = {}  # frames by reason
+        self._target = np.zeros(4)
+        self._stopped_at = 0.0
+        self._healthy_since: float | None = None
+        self._last_frame: float | None = None  # steady time of the newest good frame
+        self._last_stamp = -np.inf
+        self._look_after = -np.inf  # stamp that the next decision's frame must exceed
+        self._bad_frames = self._late_inferences = 0
+        self._ticket = 0
+        self._inferring_since: float | None = None
+        self._pending_action: int | None = None
+
+    # Frames.
+
+    def admit(self, stamp: float, clock: float | None) -> bool:
+        """May a frame be used? Judges its stamp against the last one and the clock [s].
+
+        A frame that may not is counted in `dropped`, and is as good as none.
+        """
+        reason = None
+        if stamp <= self._last_stamp:
+            reason = 'reordered or duplicate stamp'
+        elif clock is not None and clock - stamp > self.limits.max_frame_age:
+            reason = f'stamp older than {self.limits.max_frame_age} s'
+        elif clock is not None and stamp - clock > self.limits.max_frame_ahead:
+            reason = f'stamp more than {self.limits.max_frame_ahead} s ahead'
+        if reason:
+            self.dropped[reason] = self.dropped.get(reason, 0) + 1
+            return False
+        self._last_stamp = stamp
+        return True
+
+    def time_jumped(self) -> None:
+        """The clock went back: forget old stamps, and stand still until enabled again."""
+        self._last_stamp = self._look_after = -np.inf
+        self._healthy_since = None
+        if self.state in (State.RUNNING, State.HOLD):
+            self._idle('the clock went back: enable again')
+
+    def good_frame(self, now: float) -> None:
+        """An admitted frame has been decoded."""
+        gap = None if self._last_frame is None else now - self._last_frame
+        if self._healthy_since is None or gap is None or gap > max(
+                self.limits.frame_timeout, self.limits.inference_timeout):
+            self._healthy_since = now
+        self._last_frame = now
+        self._bad_frames = 0
+
+    def bad_frame(self, reason: str, now: float) -> None:
+        """An admitted frame could not be decoded. Three in a row stop the robot."""
+        self.dropped[reason] = self.dropped.get(reason, 0) + 1
+        self._bad_frames += 1
+        self._healthy_since = None
+        if self._bad_frames >= 3 and self.state in (State.RUNNING, State.HOLD):
+            self.stop(f'three bad frames in a row: {reason}', now)
+
+    # Goals.
+
+    def new_goal(self, identity: object) -> bool:
+        """A goal picture came; True when it is another than the present one (a new episode)."""
+        if identity == self.goal_identity:
+            return False
+        self.goal_identity, self.goal_ready = identity, False
+        self._abandon()
+        if self.state is State.RUNNING:
+            self.state, self.reason = State.HOLD, 'goal changed'
+        return True
+
+    def accept_goal(self, stamp: float) -> None:
+        """The policy knows the goal. Frames up to `stamp` belong to the episode before."""
+        self.goal_ready, self.decisions = True, 0
+        self._look_after = stamp
+
+    def refuse_goal(self) -> None:
+        """The goal picture was unusable: as if there were none."""
+        self.goal_identity, self.goal_ready = None, False
+
+    # Commands of people.
+
+    def enable(self, now: float, blockers: tuple[str, ...] = ()) -> tuple[bool, str]:
+        """Allow motion; refused with everything that is missing."""
+        missing = list(blockers)
+        if self.state is State.STOPPED:
+            missing.append(f'stopped ({self.reason}): call ~/reset first')
+        if not self.goal_ready:
+            missing.append('no usable goal: publish a picture on goal_image')
+        silent = self._last_frame is None or now - self._last_frame > self.limits.frame_timeout
+        if silent or self._healthy_since is None:
+            missing.append('no healthy frames: check image_raw' + self._drops())
+        elif now - self._healthy_since < ARMING_SECONDS:
+            missing.append(f'frames are healthy for less than {ARMING_SECONDS:.0f} s: try again')
+        if missing:
+            return False, '; '.join(missing)
+        if self.state is State.IDLE:
+            self._abandon()
+            self.state, self.reason = State.RUNNING, ''
+        return True, 'enabled'
+
+    def _drops(self) -> str:
+        return '; '.join(f' (dropped {n}: {reason})' for reason, n in self.dropped.items())
+
+    def disable(self) -> None:
+        """Stand still and fall silent; not latched."""
+        if self.state is not State.STOPPED:
+            self._idle('disabled')
+
+    def stop(self, reason: str, now: float) -> None:
+        """Zero at once, latched."""
+        if self.state is not State.STOPPED:
+            self.state, self.reason, self._stopped_at = State.STOPPED, reason, now
+        self._abandon()
+
+    def reset(self) -> None:
+        """Clear a latched stop; never enables."""
+        self._abandon()
+        self._bad_frames = self._late_inferences = 0
+        self.state, self.reason = State.IDLE, 'not enabled'
+
+    def _idle(self, reason: str) -> None:
+        self._abandon()
+        self.state, self.reason = State.IDLE, reason
+
+    def _abandon(self) -> None:
+        """Forget the action and the decision under way; velocity zero."""
+        self.phase, self.executor.action = Phase.LOOK, None
+        self._ticket += 1
+        self._inferring_since = self._pending_action = None
+        self.velocity, self._target = np.zeros(4), np.zeros(4)
+
+    # Decisions, made by another thread.
+
+    def request(self, stamp: float, now: float) -> int | None:
+        """A ticket, when a decision from a frame with this stamp is wanted now."""
+        if (self.state is not State.RUNNING or not self.goal_ready
+                or self._inferring_since is not None or stamp <= self._look_after
+                or (self.phase is Phase.MOVE and not self.continuous)
+                or self._pending_action is not None):
+            return None
+        self._inferring_since = now
+        return self._ticket
+
+    def decided(self, ticket: int, action: int, now: float) -> None:
+        """The decision behind a ticket; discarded when it is late or no longer wanted."""
+        if ticket != self._ticket or self._inferring_since is None:
+            return
+        late = now - self._inferring_since > self.limits.inference_timeout
+        self._inferring_since = None
+        if late:
+            self._late(now)
+            return
+        self._late_inferences = 0
+        self._pending_action = action
+
+    def _late(self, now: float) -> None:
+        self._ticket += 1
+        self._inferring_since = None
+        self._late_inferences += 1
+        self.velocity, self._target = np.zeros(4), np.zeros(4)
+        if self._late_inferences >= 3:
+            self.stop(f'three inferences in a row took longer than '
+                      f'{self.limits.inference_timeout} s', now)
+
+    @property
+    def ready_to_move(self) -> bool:
+        """A decision waits for the output thread."""
+        return self._pending_action is not None and self.state is State.RUNNING
+
+    # Velocities, asked for by the output thread.
+
+    def step(self, now: float, dt: float, odometry: np.ndarray | None,
+             stamp: float) -> np.ndarray | None:
+        """The velocity for the next period, or None to stay silent.
+
+        Args:
+            now: steady time [s]; dt: length of the period [s].
+            odometry: [3] x, y, yaw, or None where there is none.
+            stamp: present time in the frames' clock [s].
+        """
+        if self.state is State.STOPPED:
+            return np.zeros(4) if now - self._stopped_at < STOP_SECONDS else None
+        if self.state is State.IDLE:
+            return None
+        self._watch(now)
+        if self.state is not State.RUNNING:
+            return np.zeros(4)
+        if self._inferring_since is not None and (
+                now - self._inferring_since > self.limits.inference_timeout):
+            self._late(now)
+            return np.zeros(4)
+        return self._cruise(dt) if self.continuous else self._stop_and_go(dt, odometry, stamp)
+
+    def _watch(self, now: float) -> None:
+        """Camera silence, and holds whose cause is gone."""
+        silence = now - self._last_frame
+        if silence > self.limits.frame_stop_timeout:
+            self.stop(f'no camera frame for {self.limits.frame_stop_timeout} s', now)
+        elif silence > self.limits.frame_timeout:
+            if self.state is State.RUNNING:
+                self._abandon()
+            self.state, self.reason = State.HOLD, 'camera silent'
+        elif self.state is State.HOLD and self.goal_ready:
+            self.state, self.reason = State.RUNNING, ''
+
+    def _stop_and_go(self, dt: float, odometry: np.ndarray | None, stamp: float) -> np.ndarray:
+        if self.phase is Phase.LOOK:
+            if self._pending_action is None:
+                return np.zeros(4)
+            self.executor.begin(self._pending_action, odometry)
+            self._pending_action = None
+            self.decisions += 1
+            self.phase = Phase.MOVE
+        self.velocity, over = self.executor.velocity(dt, odometry)
+        if over:
+            self.phase = Phase.LOOK
+            self._look_after = stamp + self.limits.settle_time
+        return self.velocity
+
+    def _cruise(self, dt: float) -> np.ndarray:
+        if self._pending_action is not None:
+            self._target = cruise(self.robot, self._pending_action)
+            self._pending_action = None
+            self.decisions += 1
+        self.velocity = ramp(self.velocity, self._target, self.robot, dt)
+        return self.velocity
