@@ -51,7 +51,7 @@ TOPICS = (
     Topic('reward', 'std_msgs/msg/Float32', 'bridge', 'at a decision\'s end: 1 on arrival, else 0'),
     Topic('episode_end', 'std_msgs/msg/UInt8', 'bridge', '1 terminated, 2 truncated'),
     Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
-          'true pose in the map, for evaluation; the policy never reads it'),
+          'true pose in the map, for evaluation; the policy never reads it', depth=200),
     _latched('scene', _STRING, 'bridge', 'JSON: house, rooms, goals, limits, world version'),
     _latched('episode', _STRING, 'bridge', 'JSON: goal and start of the present episode'),
     Topic('episode_result', _STRING, 'bridge', 'JSON: outcome of the episode that ended'),

@@ -36,7 +36,6 @@ from vn_sim_bridge.world import WORLD_VERSION
 
 COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base stops
 LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base stops
-START_TIME = 1.0  # s, first stamp: zero would mean "no time yet"
 OPTICAL_FRAME = 'camera_optical_frame'
 
 # name: (default, meaning); the types of the defaults are the types of the parameters.
@@ -53,6 +52,7 @@ PARAMETERS = {
     'camera_rate': (10.0, 'pictures per simulated second in real_time and in continuous [Hz]'),
     'episodes': (0, 'episodes to run; 0: without end'),
     'max_decisions': (300, 'limit of an episode'),
+    'start_time': (1.0, 'first stamp [s]; zero would mean "no time yet"'),
     'exit_when_done': (False, 'exit after the last episode instead of standing still'),
 }
 
@@ -76,7 +76,7 @@ class SimBridgeNode(Node):
         self.robot = SimulatedRobot(
             values['house'], values['rooms'], robot=robot, size=values['size'],
             noise=values['noise'], seed=values['seed'], max_decisions=values['max_decisions'])
-        self.size = values['size']
+        self.size, self.start_time = values['size'], values['start_time']
         self.command = np.zeros(4)
         self.command_tick = 0  # when the newest command came, in ticks
         self.command_count = 0
@@ -97,6 +97,7 @@ class SimBridgeNode(Node):
              f'camera_rate lies between 1 and {1 / TICK:.0f} Hz'),
             ('size', 16 <= values['size'] <= 1024, 'size lies between 16 and 1024 pixels'),
             ('max_decisions', values['max_decisions'] >= 1, 'max_decisions is at least 1'),
+            ('start_time', values['start_time'] > 0, 'start_time is positive'),
             ('episodes', values['episodes'] >= 0, 'episodes is 0 (without end) or more'),
         )
         for name, kept, rule in rules:
@@ -198,7 +199,7 @@ class SimBridgeNode(Node):
 
     def stamp(self) -> Time:
         """The simulated time."""
-        nanoseconds = round((START_TIME + self.robot.time) * 1e9)
+        nanoseconds = round((self.start_time + self.robot.time) * 1e9)
         return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
 
     def begin_episode(self, index: int, goal_pose=None) -> None:
@@ -213,7 +214,7 @@ class SimBridgeNode(Node):
         self._episode.publish(String(data=json.dumps({
             'episode': episode.index, 'goal': episode.goal, 'room': self.robot.goal.room,
             'goal_pose': list(self.robot.goal.pose), 'start': list(episode.start),
-            'start_distance': episode.start_distance, 'stamp': START_TIME + episode.begun_at,
+            'start_distance': episode.start_distance, 'stamp': self.start_time + episode.begun_at,
             'max_decisions': self.robot.max_decisions})))
         self._goal_image.publish(message)
 

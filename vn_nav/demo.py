@@ -1,0 +1,226 @@
+"""`vn_nav demo`: bridge, policy and recorder as processes on ROS 2, then figures from the bag."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from vn_nav.errors import UserError
+from vn_nav.evaluation.bag_episodes import drives_from_bag
+from vn_nav.evaluation.metrics import summarise
+from vn_nav.evaluation.report import write_report
+from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.resources import share_file
+
+TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
+UNSEEN_HOUSE = 8  # seed
+SEED = 2026  # of starts and goals
+STALL = 60.0  # s without a finished episode after which the demo gives up
+LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up) after (\d+) decisions, ([\d.]+) m')
+RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground_truth/odom',
+            'action', 'action_names', 'collision', 'reward', 'episode_end', 'episode',
+            'episode_result', 'scene', '/diagnostics']
+
+
+class ProcessFailure(Exception):
+    """A child process died or stalled."""
+
+
+class Processes:
+    """The children of the demo, each with a log file; all are gone at the end."""
+
+    def __init__(self, logs: Path):
+        self.logs, self.running = logs, {}
+        logs.mkdir(parents=True, exist_ok=True)
+        self.environment = os.environ | {
+            'FASTRTPS_DEFAULT_PROFILES_FILE': str(share_file('config/fastdds_localhost.xml')),
+            # Others on this host do not meet the demo's robot.
+            'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', str(40 + os.getpid() % 60)),
+            'OMP_NUM_THREADS': '1', 'PYTHONUNBUFFERED': '1',
+        }
+
+    def start(self, name: str, module: str, parameters: dict) -> None:
+        """Start a node of this package with parameters."""
+        words = [sys.executable, '-m', module, '--ros-args']
+        for key, value in parameters.items():
+            words += ['-p', f'{key}:={json.dumps(value)}']
+        log = open(self.logs / f'{name}.log', 'w')
+        self.running[name] = subprocess.Popen(
+            words, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            env=self.environment, start_new_session=True)
+        log.close()
+
+    def log(self, name: str) -> str:
+        """What a child has printed so far."""
+        return (self.logs / f'{name}.log').read_text(errors='replace')
+
+    def check(self, name: str) -> None:
+        """Fail when a child has ended by itself."""
+        code = self.running[name].poll()
+        if code not in (None, 0):
+            lines = self.log(name).strip().splitlines() or ['nothing']
+            raise ProcessFailure(f'{name} ended with code {code}; its last words: {lines[-1]}')
+
+    def stop(self, name: str) -> None:
+        """SIGINT, and SIGKILL after 10 s, to the child and whatever it started."""
+        process = self.running.pop(name, None)
+        if process is None:
+            return
+        for number, patience in ((signal.SIGINT, 10), (signal.SIGKILL, 10)):
+            if process.poll() is None:
+                os.killpg(process.pid, number)
+                try:
+                    process.wait(patience)
+                except subprocess.TimeoutExpired:
+                    continue
+
+    def stop_all(self) -> None:
+        """Stop every child, the recorder last so that it hears the others end."""
+        for name in sorted(self.running, key=lambda n: n == 'recorder'):
+            self.stop(name)
+
+
+def run(out: Path, *, episodes: int = 20, unseen_episodes: int = 10,
+        checkpoint: Path | None = None) -> int:
+    """Drive, record, measure, report.
+
+    Args:
+        out: folder for bag, page and result.json; what an earlier demo left there is replaced.
+        episodes, unseen_episodes: in the trained and in the unseen house.
+        checkpoint: instead of the shipped policy.
+
+    Returns:
+        The exit code.
+    """
+    if episodes < 1 or unseen_episodes < 1:
+        raise UserError('the demo has at least one episode in each house',
+                        (episodes, unseen_episodes), 'raise --episodes, --unseen-episodes')
+    console = Console()
+    folder = Path(checkpoint) if checkpoint else share_file('models/house')
+    info = load_checkpoint(folder).info
+    places = (('trained', info['houses'][0], episodes, TRAINED_LIMIT),
+              ('unseen', UNSEEN_HOUSE, unseen_episodes, UNSEEN_LIMIT))
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ('bag', 'logs'):
+        shutil.rmtree(out / name, ignore_errors=True)
+    for name in ('report.html', 'result.json'):
+        (out / name).unlink(missing_ok=True)
+    begun = time.monotonic()
+    console.print('[bold]vn_nav demo[/]: a picture in, a robot that drives there. Simulator and '
+                  'policy are two processes that meet on ROS 2 topics alone.')
+    processes = Processes(out / 'logs')
+    try:
+        processes.start('recorder', 'vn_nav.nodes.recorder_node',
+                        {'output': str(out / 'bag'), 'topics': RECORDED})
+        for index, (place, house, count, limit) in enumerate(places):
+            _drive(console, processes, folder, place, house, info['rooms'], count, limit,
+                   start_time=1.0 + 1e5 * index)
+    except ProcessFailure as error:
+        console.print(f'[red]vn_nav demo: {error}[/]; logs are in {out / "logs"}')
+        return 1
+    finally:
+        processes.stop_all()
+    result = _results(out, places, info['rooms'])
+    result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
+               'checkpoint': folder.name, 'date': datetime.date.today().isoformat()}
+    write_report(out / 'report.html', drives_from_bag(out / 'bag', pictures=True), result)
+    result['seconds'] = round(time.monotonic() - begun, 1)
+    (out / 'result.json').write_text(json.dumps(result, indent=2) + '\n')
+    _show(console, result, out)
+    return 0
+
+
+def _drive(console: Console, processes: Processes, checkpoint: Path, place: str, house: int,
+           rooms: int, count: int, limit: int, start_time: float) -> None:
+    """All episodes in one house."""
+    base = str(share_file('config/robots/demo_base.yaml'))
+    bridge, policy = f'bridge_{place}', f'policy_{place}'
+    note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
+    console.print(f'\n[bold]{place} house[/], seed {house}{note}')
+    processes.start(bridge, 'vn_sim_bridge.bridge_node', {
+        'house': house, 'rooms': rooms, 'robot': base, 'time': 'lock_step', 'seed': SEED,
+        'episodes': count, 'max_decisions': limit, 'exit_when_done': True,
+        'start_time': start_time})
+    processes.start(policy, 'vn_nav.nodes.policy_node', {
+        'checkpoint': str(checkpoint), 'robot': base, 'time': 'lock_step', 'auto_enable': True,
+        'seed': SEED})
+    seen, progress = 0, time.monotonic()
+    with Live(_progress([], count), console=console, refresh_per_second=8) as live:
+        while True:
+            done = LINE.findall(processes.log(bridge))
+            if len(done) > seen:
+                seen, progress = len(done), time.monotonic()
+            live.update(_progress(done, count))
+            processes.check('recorder')
+            processes.check(policy)
+            processes.check(bridge)
+            if processes.running[bridge].poll() is not None:
+                live.update(_progress(LINE.findall(processes.log(bridge)), count))
+                break
+            if time.monotonic() - progress > STALL:
+                words = (processes.log(policy).strip().splitlines() or ['nothing'])[-1]
+                raise ProcessFailure(f'no episode ended for {STALL:.0f} s; the policy\'s last '
+                                     f'words: {words}')
+            time.sleep(0.1)
+    processes.stop(policy)
+    processes.stop(bridge)
+
+
+def _progress(done: list[tuple], count: int) -> Table:
+    """The live view: one row an episode, the newest at the bottom."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ('episode', 'goal', 'outcome', 'decisions', 'metres'):
+        table.add_column(heading, justify='left' if heading in ('goal', 'outcome') else 'right')
+    for number, room, outcome, decisions, metres in done[-12:]:
+        colour = 'green' if outcome == 'arrived' else 'yellow'
+        table.add_row(f'{int(number) + 1}/{count}', room, f'[{colour}]{outcome}[/]', decisions,
+                      metres)
+    if len(done) < count:
+        table.add_row(f'{len(done) + 1}/{count}', '...', 'driving' if done else 'starting', '', '')
+    return table
+
+
+def _results(out: Path, places, rooms: int) -> dict:
+    """Figures from the bag, and the random control on the same starts."""
+    from vn_nav.cli import make_env
+    from vn_nav.evaluation.evaluator import random_actor, run_episodes
+    from vn_nav.robot import RobotSpec
+    result = {}
+    for (place, house, count, limit), drive in zip(places, drives_from_bag(out / 'bag'),
+                                                   strict=True):
+        figures = summarise([recorded.episode for recorded in drive.episodes])
+        env = make_env([house], rooms, count, max_decisions=limit)
+        control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
+        result[place] = figures | {'house': house, 'max_decisions': limit,
+                                   'random': summarise(control)}
+    return result
+
+
+def _show(console: Console, result: dict, out: Path) -> None:
+    table = Table(title='Measured from the bag of this run')
+    for heading in ('house', 'policy', 'episodes', 'success', 'SPL', 'decisions', 'collisions'):
+        table.add_column(heading, justify='left' if heading in ('house', 'policy') else 'right')
+    for place in ('trained', 'unseen'):
+        for policy, r in (('vn_nav over ROS 2', result[place]),
+                          ('random actions', result[place]['random'])):
+            table.add_row(place, policy, str(r['episodes']), f'{r["success"]:.0%}',
+                          f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["collisions"]:.1%}')
+    console.print()
+    console.print(table)
+    console.print(f'page    {out / "report.html"}\nbag     {out / "bag"}\n'
+                  f'figures {out / "result.json"}\n{result["seconds"]:.0f} s in all')
+
+

@@ -1,0 +1,124 @@
+"""Episodes out of a bag that the sim bridge's topics were recorded into.
+
+Nothing is taken from the bridge's own summaries: decisions, collisions, success and the metres
+driven are counted from `reward`, `collision`, `episode_end` and `ground_truth/odom`.
+"""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from vn_msgs_py.images import decode_rgb
+from vn_msgs_py.motion import odometry_to_array
+from vn_nav.bags.reader import read_bag
+from vn_nav.errors import UserError
+from vn_nav.evaluation.metrics import Episode
+
+TOPICS = ('scene', 'episode', 'reward', 'collision', 'episode_end', 'ground_truth/odom',
+          'goal_image', 'image_raw')
+# Messages of one moment can change places on their way. The bridge stands still for a tick of
+# 50 ms after a new episode begins, so what comes within this time belongs to the one before.
+GRACE = 25_000_000  # ns
+
+
+@dataclasses.dataclass
+class RecordedEpisode:
+    """One journey as the bag shows it."""
+
+    facts: dict  # of the `episode` topic: index, goal, room, start, start_distance, limits
+    house: int
+    episode: Episode
+    finished: bool
+    trajectory: np.ndarray  # [K,3] x, y, yaw in the map
+    goal_picture: np.ndarray | None  # [H,W,3] uint8
+    pictures: list[np.ndarray]  # camera pictures, [H,W,3] uint8, in order
+
+
+@dataclasses.dataclass
+class Drive:
+    """All episodes in one house."""
+
+    scene: dict
+    episodes: list[RecordedEpisode]
+
+
+def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive]:
+    """Every house of a bag with its finished episodes, in order.
+
+    Args:
+        folder: of the bag.
+        pictures: also decode goal and camera pictures.
+
+    Raises:
+        UserError: no readable bag, or one without the bridge's topics.
+    """
+    records = {name: [] for name in TOPICS}
+    for record in read_bag(folder, TOPICS if pictures else TOPICS[:6]):
+        records[record.topic].append(record)
+    scenes = [(r.stamp, json.loads(r.message.data)) for r in records['scene']]
+    begins = [(r.stamp, json.loads(r.message.data)) for r in records['episode']]
+    if not scenes or not begins:
+        raise UserError('the bag holds the topics scene and episode', str(folder),
+                        'record the sim bridge with recorder_node')
+    order = [stamp for stamp, _ in begins]
+
+    def owner(stamp: int) -> int:
+        """The episode that a message received at `stamp` belongs to."""
+        return max(0, bisect.bisect_left(order, stamp - GRACE) - 1)
+
+    count = len(begins)
+    rewards, touched, ends = ([[] for _ in range(count)] for _ in range(3))
+    for topic, lists in (('reward', rewards), ('collision', touched), ('episode_end', ends)):
+        for record in records[topic]:
+            lists[owner(record.stamp)].append(record.message.data)
+    # Poses and pictures carry the simulated time, which tells exactly where they belong.
+    begun_at = [facts['stamp'] for _, facts in begins]
+
+    def owner_by_stamp(seconds: float) -> int:
+        return max(0, bisect.bisect_right(begun_at, seconds + 1e-6) - 1)
+
+    poses = [[] for _ in range(count)]
+    for record in records['ground_truth/odom']:
+        values = odometry_to_array(record.message)
+        poses[owner_by_stamp(values[6])].append(values[:3])
+    goal_pictures: list[np.ndarray | None] = [None] * count
+    views = [[] for _ in range(count)]
+    for record in records['goal_image']:
+        goal_pictures[owner_by_stamp(_seconds(record.message))] = decode_rgb(record.message)
+    for record in records['image_raw']:
+        views[owner_by_stamp(_seconds(record.message))].append(decode_rgb(record.message))
+    drives = [Drive(scene, []) for _, scene in scenes]
+    for k, (stamp, facts) in enumerate(begins):
+        place = max(0, bisect.bisect_right([s for s, _ in scenes], stamp + GRACE) - 1)
+        if not ends[k]:
+            continue  # cut off: no figure counts it
+        trajectory = np.array(poses[k]).reshape(-1, 3)
+        episode = _measure(facts, trajectory, rewards[k], touched[k], ends[k])
+        drives[place].episodes.append(RecordedEpisode(
+            facts, drives[place].scene['house'], episode, True, trajectory, goal_pictures[k],
+            views[k]))
+    return drives
+
+
+def _seconds(message) -> float:
+    return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+
+
+def _measure(facts: dict, trajectory: np.ndarray, rewards: list, touched: list,
+             ends: list) -> Episode:
+    steps = np.hypot(*np.diff(trajectory[:, :2], axis=0).T) if len(trajectory) > 1 else [0.0]
+    goal = facts['goal_pose']
+    last = trajectory[-1] if len(trajectory) else np.full(3, np.nan)
+    turn = (last[2] - goal[2] + math.pi) % (2 * math.pi) - math.pi
+    return Episode(
+        success=ends[-1] == 1 and sum(rewards) > 0, start_distance=facts['start_distance'],
+        path_length=float(np.sum(steps)), decisions=len(rewards), collisions=int(sum(touched)),
+        # At the speed of the recorded base; straight-line distance: a bag has no floor map.
+        seconds=0.05 * len(trajectory), stop_distance=math.dist(last[:2], goal[:2]),
+        stop_heading=abs(turn), reward=float(sum(rewards)), goal=facts['room'])

@@ -1,0 +1,93 @@
+"""`recorder_node`: topics of the contract into a rosbag2 bag, where there is no `ros2 bag`.
+
+Run: `ros2 run vn_nav recorder_node --ros-args -p output:=my_drive`.
+"""
+
+from __future__ import annotations
+
+import datetime
+import importlib
+import signal
+import sys
+import threading
+import time
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from vn_msgs_py.topics import TOPICS, topic
+from vn_nav.bags.recorder import BagWriter
+from vn_nav.errors import UserError
+from vn_nav.nodes.qos import qos
+
+QUEUE = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
+
+
+class RecorderNode(Node):
+    """Writes what it hears, as it was serialised."""
+
+    def __init__(self):
+        super().__init__('recorder_node')
+
+        def parameter(name, default, meaning):
+            return self.declare_parameter(
+                name, default, ParameterDescriptor(description=meaning, read_only=True)).value
+
+        default = f'rosbag2_{datetime.datetime.now():%Y_%m_%d-%H_%M_%S}'
+        output = parameter('output', default, 'folder of the bag; it must not exist')
+        names = parameter('topics', [entry.name for entry in TOPICS],
+                          'topics of the contract to record')
+        try:
+            entries = [topic(name) for name in names]
+        except KeyError as error:
+            raise UserError('recorded topics are of the contract', error.args[0],
+                            'choose from vn_msgs_py.topics') from error
+        self.writer = BagWriter(output, entries)
+        self.count = 0
+        for entry in entries:
+            package, _, kind = entry.type.split('/')
+            message = getattr(importlib.import_module(f'{package}.msg'), kind)
+            self.create_subscription(message, entry.name, self._recorder(entry.name),
+                                     qos(entry.name, depth=QUEUE), raw=True)
+        self.get_logger().info(f'recording {len(entries)} topics into {output}')
+
+    def _recorder(self, name: str):
+        def record(data: bytes) -> None:
+            self.writer.write(name, data, time.time_ns())
+            self.count += 1
+        return record
+
+
+def main(args=None) -> int:
+    """Entry point: SIGINT and SIGTERM finish the bag."""
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    node = None
+    try:
+        node = RecorderNode()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not ended.is_set():
+            executor.spin_once(timeout_sec=0.1)
+    except UserError as error:
+        print(f'recorder_node: {error}', file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        if node is not None:
+            if hasattr(node, 'writer'):
+                node.writer.close()
+                node.get_logger().info(f'{node.count} messages recorded')
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
