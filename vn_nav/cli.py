@@ -217,7 +217,7 @@ def run_publish(args) -> int:
 def run_demo(args) -> int:
     """`vn_nav demo`."""
     from vn_nav.demo import run
-    return run(args.out, episodes=args.episodes, unseen_episodes=args.unseen_episodes,
+    return run(args.out, make_env=make_env, episodes=args.episodes, unseen_episodes=args.unseen_episodes,
                checkpoint=args.checkpoint)
 
 

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -19,10 +20,12 @@ from rich.table import Table
 
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag
+from vn_nav.evaluation.evaluator import random_actor, run_episodes
 from vn_nav.evaluation.metrics import summarise
 from vn_nav.evaluation.report import write_report
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.resources import share_file
+from vn_nav.robot import RobotSpec
 
 TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
 UNSEEN_HOUSE = 8  # seed
@@ -92,12 +95,14 @@ class Processes:
             self.stop(name)
 
 
-def run(out: Path, *, episodes: int = 20, unseen_episodes: int = 10,
+def run(out: Path, *, make_env: Callable, episodes: int = 20, unseen_episodes: int = 10,
         checkpoint: Path | None = None) -> int:
     """Drive, record, measure, report.
 
     Args:
         out: folder for bag, page and result.json; what an earlier demo left there is replaced.
+        make_env: (houses, rooms, environments, max_decisions=...) -> vector environment, for the
+            random control.
         episodes, unseen_episodes: in the trained and in the unseen house.
         checkpoint: instead of the shipped policy.
 
@@ -133,7 +138,7 @@ def run(out: Path, *, episodes: int = 20, unseen_episodes: int = 10,
         return 1
     finally:
         processes.stop_all()
-    result = _results(out, places, info['rooms'])
+    result = _results(out, places, info['rooms'], make_env)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
                'checkpoint': folder.name, 'date': datetime.date.today().isoformat()}
     write_report(out / 'report.html', drives_from_bag(out / 'bag', pictures=True), result)
@@ -193,11 +198,8 @@ def _progress(done: list[tuple], count: int) -> Table:
     return table
 
 
-def _results(out: Path, places, rooms: int) -> dict:
+def _results(out: Path, places, rooms: int, make_env: Callable) -> dict:
     """Figures from the bag, and the random control on the same starts."""
-    from vn_nav.cli import make_env
-    from vn_nav.evaluation.evaluator import random_actor, run_episodes
-    from vn_nav.robot import RobotSpec
     result = {}
     for (place, house, count, limit), drive in zip(places, drives_from_bag(out / 'bag'),
                                                    strict=True):

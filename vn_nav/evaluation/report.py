@@ -132,8 +132,12 @@ def _chosen(episodes: list[RecordedEpisode], most: int = 4) -> list[RecordedEpis
 
 def _journey(recorded: RecordedEpisode) -> str:
     e = recorded.episode
-    picked = np.unique(np.linspace(0, len(recorded.pictures) - 1, STRIP).round().astype(int))
-    frames = ''.join(f'<figure><img alt="" src="{_picture(recorded.pictures[i])}">'
+    # Pictures taken while the robot stood still repeat themselves.
+    views = [view for before, view in zip([None, *recorded.pictures], recorded.pictures,
+                                          strict=False)
+             if before is None or not np.array_equal(before, view)]
+    picked = np.unique(np.linspace(0, len(views) - 1, STRIP).round().astype(int))
+    frames = ''.join(f'<figure><img alt="" src="{_picture(views[i])}">'
                      f'<figcaption>{i}</figcaption></figure>' for i in picked)
     kind, words = ('yes', 'arrived') if e.success else ('no', 'gave up')
     return f"""<div class="journey"><h3>To the {html.escape(e.goal)}:
