@@ -68,12 +68,11 @@ class ActionExecutor:
             self.action = None
             return np.zeros(4), True
         acceleration = self.robot.acceleration(self._axis)
-        # The fastest speed from which periods of full braking still end at the target:
-        # v dt + (v - a dt) dt + ... <= remaining.
+        # The fastest speed from which n periods of full braking end exactly at the target:
+        # v dt + (v - a dt) dt + ... + (v - (n - 1) a dt) dt = remaining.
         step = acceleration * dt
-        braking = -step / 2 + math.sqrt(step * step / 4 + 2 * acceleration * remaining)
-        if remaining <= step * dt:
-            braking = remaining / dt  # the last period lands on the target
+        periods = max(1, math.ceil((math.sqrt(1 + 8 * remaining / (step * dt)) - 1) / 2 - 1e-9))
+        braking = remaining / (periods * dt) + step * (periods - 1) / 2
         speed = min(self.robot.max_velocity(self._axis), self._speed + step,
                     max(braking, self.creep))
         self._speed, self._elapsed, self._before = speed, self._elapsed + dt, self._covered

@@ -1,0 +1,223 @@
+"""The state machine: arming, hold, stop, decisions, and who may move when."""
+
+import numpy as np
+import pytest
+
+from vn_nav.policy.navigator import Limits, Navigator, State
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+
+DT = 0.05
+ODOMETRY = np.zeros(3)
+
+
+class Rig:
+    """A navigator with a clock and a camera."""
+
+    def __init__(self, **options):
+        self.navigator = Navigator(RobotSpec().with_actions(DRIVE_ACTIONS), Limits(), **options)
+        self.now = 100.0
+
+    def frame(self):
+        """One good frame now; the ticket of a decision if one is wanted."""
+        assert self.navigator.admit(self.now, self.now)
+        self.navigator.good_frame(self.now)
+        return self.navigator.request(self.now, self.now)
+
+    def step(self, odometry=ODOMETRY):
+        self.now += DT
+        return self.navigator.step(self.now, DT, odometry, self.now)
+
+    def frame_later(self):
+        """A period, then a frame."""
+        self.step()
+        return self.frame()
+
+    def arm(self):
+        """A goal, and a bit more than a second of frames."""
+        self.navigator.new_goal((1, 0))
+        self.navigator.accept_goal(-np.inf)
+        for _ in range(22):
+            self.now += DT
+            self.frame()
+        assert self.navigator.enable(self.now)[0]
+
+    def decide(self, action=0):
+        """Frames until a decision is wanted; then make it."""
+        for _ in range(60):
+            self.step()
+            ticket = self.frame()
+            if ticket is not None:
+                self.navigator.decided(ticket, action, self.now + 0.01)
+                return
+        raise AssertionError('no decision was ever wanted')
+
+
+@pytest.fixture
+def rig():
+    return Rig()
+
+
+def test_enabling_says_what_is_missing(rig):
+    done, message = rig.navigator.enable(rig.now)
+    assert not done and 'goal_image' in message and 'image_raw' in message
+    rig.navigator.new_goal((1, 0))
+    rig.navigator.accept_goal(-np.inf)
+    rig.frame()
+    done, message = rig.navigator.enable(rig.now)
+    assert not done and 'less than 1 s' in message
+    assert not rig.navigator.enable(rig.now, ('an intruder',))[0]
+    rig.arm()
+    assert rig.navigator.state is State.RUNNING
+
+
+def test_silent_until_enabled(rig):
+    assert rig.step() is None
+    rig.arm()
+    assert np.array_equal(rig.step(), np.zeros(4))
+
+
+def test_a_decision_moves_and_the_next_waits_for_rest(rig):
+    rig.arm()
+    rig.decide(action=0)
+    first = rig.step()
+    assert first[0] > 0 and (first[1:] == 0).all()
+    assert rig.frame() is None  # in motion nobody decides
+    pose = np.zeros(3)
+    for _ in range(200):
+        velocity = rig.step(pose)
+        pose[0] += velocity[0] * DT
+        rig.frame()
+        if not velocity.any():
+            break
+    assert pose[0] == pytest.approx(0.5, abs=0.01)
+    ended = rig.now
+    while (ticket := rig.frame_later()) is None:
+        assert rig.now < ended + 1
+    assert ticket is not None and rig.now >= ended + rig.navigator.limits.settle_time
+
+
+def test_camera_silence_holds_then_latches(rig):
+    rig.arm()
+    rig.decide()
+    assert rig.step().any()
+    start, held, stopped = rig.now, None, None
+    while rig.now < start + 3:
+        velocity = rig.step()
+        if rig.navigator.state is State.HOLD and held is None:
+            held = rig.now - start
+        if rig.navigator.state is State.STOPPED and stopped is None:
+            stopped = rig.now - start
+        if held is not None and velocity is not None:
+            assert not velocity.any()
+    assert held <= 0.30 and 0.9 <= stopped <= 1.1
+    assert velocity is None  # a second of zeros, then silence
+    rig.frame()
+    assert rig.navigator.state is State.STOPPED  # latched
+    assert not rig.navigator.enable(rig.now)[0]
+    rig.navigator.reset()
+    assert rig.navigator.state is State.IDLE  # reset never enables
+    rig.arm()
+
+
+def test_a_short_silence_heals_by_itself(rig):
+    rig.arm()
+    for _ in range(8):
+        rig.step()
+    assert rig.navigator.state is State.HOLD
+    rig.frame()
+    rig.step()
+    assert rig.navigator.state is State.RUNNING
+
+
+def test_a_new_goal_holds_and_begins_a_new_episode(rig):
+    rig.arm()
+    rig.decide()
+    assert rig.step().any()
+    assert not rig.navigator.new_goal((1, 0))  # the same stamp is the same goal
+    assert rig.step().any()
+    assert rig.navigator.new_goal((2, 0))
+    rig.frame()
+    assert not rig.step().any() and rig.navigator.state is State.HOLD
+    rig.navigator.accept_goal(-np.inf)
+    rig.frame()
+    rig.step()
+    assert rig.navigator.state is State.RUNNING and rig.navigator.decisions == 0
+
+
+def test_a_decision_for_the_old_goal_is_discarded(rig):
+    rig.arm()
+    rig.step()
+    ticket = rig.frame()
+    rig.navigator.new_goal((2, 0))
+    rig.navigator.accept_goal(-np.inf)
+    rig.navigator.decided(ticket, 0, rig.now)
+    assert not rig.step().any()
+    assert not rig.navigator.ready_to_move
+
+
+@pytest.mark.parametrize('stamp, reason', [
+    (99.0, 'older'), (100.2, 'ahead'), (99.94, None)])
+def test_stamps_are_judged(rig, stamp, reason):
+    assert rig.navigator.admit(stamp, rig.now) == (reason is None)
+    if reason:
+        assert any(reason in key for key in rig.navigator.dropped)
+
+
+def test_duplicate_and_reordered_frames_are_dropped(rig):
+    assert rig.navigator.admit(100.0, 100.0)
+    assert not rig.navigator.admit(100.0, 100.0)
+    assert not rig.navigator.admit(99.99, 100.0)
+    assert rig.navigator.dropped['reordered or duplicate stamp'] == 2
+
+
+def test_three_bad_frames_in_a_row_stop(rig):
+    rig.arm()
+    for _ in range(2):
+        rig.navigator.bad_frame('unknown encoding', rig.now)
+    rig.frame_later()
+    for _ in range(2):
+        rig.navigator.bad_frame('unknown encoding', rig.now)
+    assert rig.navigator.state is State.RUNNING
+    rig.navigator.bad_frame('unknown encoding', rig.now)
+    assert rig.navigator.state is State.STOPPED and 'bad frames' in rig.navigator.reason
+
+
+def test_late_inference_is_discarded_and_the_third_latches(rig):
+    rig.arm()
+    for miss in range(3):
+        rig.step()
+        ticket = None
+        while ticket is None:
+            ticket = rig.frame_later()
+        for _ in range(3):  # 150 ms without an answer
+            velocity = rig.step()
+        assert not velocity.any()
+        rig.navigator.decided(ticket, 0, rig.now)
+        assert not rig.step().any(), 'a late decision must not move the robot'
+        assert (rig.navigator.state is State.STOPPED) == (miss == 2)
+
+
+def test_stop_is_immediate_even_in_motion(rig):
+    rig.arm()
+    rig.decide()
+    assert rig.step().any()
+    rig.navigator.stop('~/stop was called', rig.now)
+    assert np.array_equal(rig.step(), np.zeros(4))
+
+
+def test_a_clock_that_goes_back_disarms(rig):
+    rig.arm()
+    rig.navigator.time_jumped()
+    assert rig.step() is None and rig.navigator.state is State.IDLE
+
+
+def test_continuous_mode_decides_in_motion():
+    rig = Rig(continuous=True)
+    rig.arm()
+    rig.decide(action=0)
+    for _ in range(5):
+        velocity = rig.step()
+        ticket = rig.frame()
+        assert ticket is not None
+        rig.navigator.decided(ticket, 0, rig.now)
+    assert velocity[0] > 0.05
