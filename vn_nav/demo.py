@@ -20,10 +20,10 @@ from rich.table import Table
 
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag
-from vn_nav.evaluation.evaluator import random_actor, run_episodes
+from vn_nav.evaluation.evaluator import policy_actor, random_actor, run_episodes
 from vn_nav.evaluation.metrics import summarise
 from vn_nav.evaluation.report import write_report
-from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
 
@@ -114,7 +114,8 @@ def run(out: Path, *, make_env: Callable, episodes: int = 20, unseen_episodes: i
                         (episodes, unseen_episodes), 'raise --episodes, --unseen-episodes')
     console = Console()
     folder = Path(checkpoint) if checkpoint else share_file('models/house')
-    info = load_checkpoint(folder).info
+    loaded = load_checkpoint(folder)
+    info = loaded.info
     places = (('trained', info['houses'][0], episodes, TRAINED_LIMIT),
               ('unseen', UNSEEN_HOUSE, unseen_episodes, UNSEEN_LIMIT))
     out = Path(out)
@@ -138,7 +139,7 @@ def run(out: Path, *, make_env: Callable, episodes: int = 20, unseen_episodes: i
         return 1
     finally:
         processes.stop_all()
-    result = _results(out, places, info['rooms'], make_env)
+    result = _results(out, places, loaded, make_env)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
                'checkpoint': folder.name, 'date': datetime.date.today().isoformat()}
     write_report(out / 'report.html', drives_from_bag(out / 'bag', pictures=True), result)
@@ -198,16 +199,19 @@ def _progress(done: list[tuple], count: int) -> Table:
     return table
 
 
-def _results(out: Path, places, rooms: int, make_env: Callable) -> dict:
-    """Figures from the bag, and the random control on the same starts."""
+def _results(out: Path, places, checkpoint: LoadedCheckpoint, make_env: Callable) -> dict:
+    """Figures from the bag; on the same starts random actions, and the policy without ROS."""
     result = {}
     for (place, house, count, limit), drive in zip(places, drives_from_bag(out / 'bag'),
                                                    strict=True):
         figures = summarise([recorded.episode for recorded in drive.episodes])
-        env = make_env([house], rooms, count, max_decisions=limit)
+        env = make_env([house], checkpoint.info['rooms'], count, max_decisions=limit)
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
+        actor = policy_actor(env, checkpoint.network, checkpoint.info['decoding'], SEED)
+        in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
         result[place] = figures | {'house': house, 'max_decisions': limit,
-                                   'random': summarise(control)}
+                                   'random': summarise(control),
+                                   'without_ros': summarise(in_process)}
     return result
 
 
@@ -216,7 +220,8 @@ def _show(console: Console, result: dict, out: Path) -> None:
     for heading in ('house', 'policy', 'episodes', 'success', 'SPL', 'decisions', 'collisions'):
         table.add_column(heading, justify='left' if heading in ('house', 'policy') else 'right')
     for place in ('trained', 'unseen'):
-        for policy, r in (('vn_nav over ROS 2', result[place]),
+        for policy, r in (('vn_nav, ROS 2', result[place]),
+                          ('the same without ROS', result[place]['without_ros']),
                           ('random actions', result[place]['random'])):
             table.add_row(place, policy, str(r['episodes']), f'{r["success"]:.0%}',
                           f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["collisions"]:.1%}')

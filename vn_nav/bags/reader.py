@@ -18,11 +18,11 @@ class Record(NamedTuple):
 
     topic: str  # as recorded, without the leading slash
     message: Any
-    stamp: int  # received, ns since 1970
+    stamp: int  # when it was published, ns since 1970
 
 
 def read_bag(folder: str | Path, topics: tuple[str, ...] | None = None) -> Iterator[Record]:
-    """The messages of a bag in the order of their reception.
+    """The messages of a bag in the order of time.
 
     Args:
         folder: of the bag.

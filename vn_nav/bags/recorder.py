@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_typestore
@@ -28,9 +35,9 @@ class BagWriter:
     """
 
     def __init__(self, folder: str | Path, topics: Iterable[Topic]):
-        self._writer = Writer(Path(folder), version=9, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         try:
+            self._writer = Writer(Path(folder), version=9, storage_plugin=StoragePlugin.MCAP)
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except (WriterError, OSError) as error:
             raise UserError('a bag is recorded into a folder of its own', str(error),
@@ -43,7 +50,7 @@ class BagWriter:
             for topic in topics}
 
     def write(self, name: str, data: bytes, stamp: int) -> None:
-        """Append one CDR message of a topic, received at `stamp` [ns since 1970]."""
+        """Append one CDR message of a topic, published at `stamp` [ns since 1970]."""
         self._writer.write(self._connections[name], stamp, data)
 
     def close(self) -> None:

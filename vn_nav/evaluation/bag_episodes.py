@@ -22,9 +22,9 @@ from vn_nav.evaluation.metrics import Episode
 
 TOPICS = ('scene', 'episode', 'reward', 'collision', 'episode_end', 'ground_truth/odom',
           'goal_image', 'image_raw')
-# Messages of one moment can change places on their way. The bridge stands still for a tick of
-# 50 ms after a new episode begins, so what comes within this time belongs to the one before.
-GRACE = 25_000_000  # ns
+# The bridge publishes an outcome just before the next episode, and then stands still for a tick of
+# 50 ms: what comes this long after an episode's beginning still belongs to the one before.
+GRACE = 5_000_000  # ns
 
 
 @dataclasses.dataclass
@@ -69,7 +69,7 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
     order = [stamp for stamp, _ in begins]
 
     def owner(stamp: int) -> int:
-        """The episode that a message received at `stamp` belongs to."""
+        """The episode that a message published at `stamp` belongs to."""
         return max(0, bisect.bisect_left(order, stamp - GRACE) - 1)
 
     count = len(begins)

@@ -40,6 +40,7 @@ from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec, load_robot
 
 LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step
+CROSSING = 0.03  # s of wall time, see _output_lock_step
 
 # name: (default, meaning, range or None). Ranges are [least, most] in the parameter's unit.
 PARAMETERS = {
@@ -87,6 +88,7 @@ class PolicyNode(LifecycleNode):
         self._camera_fov: float | None = None
         self._odometry: np.ndarray | None = None
         self._odometry_stamp = 0.0
+        self._odometry_rests = True
         self._odometry_received = -math.inf
         self._odometry_count = 0
         self._last_diagnosis: tuple | None = None
@@ -111,10 +113,15 @@ class PolicyNode(LifecycleNode):
         try:
             self._configure()
         except UserError as error:
-            self.failure = str(error)
-            self.get_logger().error(self.failure)
+            self._fail(str(error))
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
+
+    def _fail(self, reason: str) -> None:
+        """Say why a transition failed: once. With autostart `main` says it and exits."""
+        self.failure = reason
+        if not self.get_parameter('autostart').value:
+            self.get_logger().error(reason)
 
     def _configure(self) -> None:
         value = {name: self.get_parameter(name).value for name in PARAMETERS}
@@ -172,9 +179,8 @@ class PolicyNode(LifecycleNode):
         """Start looking; motion needs ~/enable."""
         others = self._other_publishers()
         if others:
-            self.failure = (f'this node alone publishes its command topic; received {others} more '
-                            'publisher(s) on cmd_vel; remap one of them (twist_mux combines them)')
-            self.get_logger().error(self.failure)
+            self._fail(f'this node alone publishes its command topic; received {others} more '
+                       'publisher(s) on cmd_vel; remap one of them (twist_mux combines them)')
             return TransitionCallbackReturn.FAILURE
         self._running = True
         self._threads = [threading.Thread(target=self._guard, args=(loop,), name=loop.__name__,
@@ -263,6 +269,7 @@ class PolicyNode(LifecycleNode):
             if self.lock_step and values[6] < self._odometry_stamp:
                 self.navigator.time_jumped()
             self._odometry, self._odometry_stamp = values[:3], values[6]
+            self._odometry_rests = not values[3:6].any()
             self._odometry_received = time.monotonic()
             self._odometry_count += 1
             self._wake.notify_all()
@@ -460,20 +467,30 @@ class PolicyNode(LifecycleNode):
                 self._send(velocity)
 
     def _output_lock_step(self) -> None:
-        """One command for every odometry message; the first of a motion goes out at once."""
-        answered = self._odometry_count
-        moving = False
+        """One command for every odometry message; the first of a motion goes out at once.
+
+        That first command may cross an odometry message that the bridge, still at rest, had just
+        sent. Answering that one too would put every later command one tick ahead. It shows in its
+        velocity of zero; so after a first command, odometry at rest gets no answer unless the
+        next one stays away (the robot was blocked from the first tick on).
+        """
+        answered, moving, first = self._odometry_count, False, False
         while True:
             with self._wake:
                 self._wake.wait_for(
                     lambda: not self._running or self._odometry_count > answered
                     or (not moving and self.navigator.ready_to_move), timeout=0.5)
+                if first and self._odometry_rests and self._odometry_count > answered:
+                    answered = self._odometry_count
+                    self._wake.wait_for(lambda: not self._running
+                                        or self._odometry_count > answered, timeout=CROSSING)
                 if not self._running:
                     return
                 answered = self._odometry_count
                 velocity = self.navigator.step(time.monotonic(), self.period, self._odometry,
                                                self._odometry_stamp)
-                moving = velocity is not None and bool(velocity.any())
+                moved = velocity is not None and bool(velocity.any())
+                moving, first = moved, moved and not moving
             if velocity is not None:
                 self._send(velocity)
 

@@ -10,7 +10,6 @@ import importlib
 import signal
 import sys
 import threading
-import time
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
@@ -55,8 +54,10 @@ class RecorderNode(Node):
         self.get_logger().info(f'recording {len(entries)} topics into {output}')
 
     def _recorder(self, name: str):
-        def record(data: bytes) -> None:
-            self.writer.write(name, data, time.time_ns())
+        def record(data: bytes, info: dict) -> None:
+            # The publisher's time: a busy recorder takes topics in turn, and the time of reception
+            # would then put them out of order.
+            self.writer.write(name, data, info['source_timestamp'])
             self.count += 1
         return record
 

@@ -1,0 +1,52 @@
+"""Real nodes in child processes for the two-process tests."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import torch
+
+from vn_nav.policy.checkpoint import save_checkpoint
+from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.robot import DRIVE_ACTIONS
+from vn_sim_bridge.world import WORLD_VERSION
+
+
+def write_checkpoint(folder, size=84, seed=0):
+    """A small real checkpoint with seeded random weights: nearly uniform actions."""
+    torch.manual_seed(seed)
+    network = Policy(NetworkConfig(actions=DRIVE_ACTIONS, size=size, channels=(4, 4, 4),
+                                   features=16, hidden=16))
+    save_checkpoint(folder, network, {'world_version': WORLD_VERSION, 'camera_fov_deg': 90.0,
+                                      'camera_height': 1.0, 'houses': [7], 'rooms': 5})
+    return folder
+
+
+@contextlib.contextmanager
+def child(module, log, **parameters):
+    """A node as a process; killed at the end if it still runs."""
+    words = [sys.executable, '-m', module, '--ros-args']
+    for name, value in parameters.items():
+        words += ['-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}']
+    with open(log, 'w') as file:
+        process = subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT,
+                                   start_new_session=True,
+                                   env=os.environ | {'OMP_NUM_THREADS': '1'})
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def wait_until(condition, spin, seconds=20.0):
+    """Call `spin` until the condition holds; the seconds it took."""
+    begun = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begun < seconds, f'not within {seconds} s'
+        spin()
+    return time.monotonic() - begun

@@ -1,0 +1,164 @@
+"""sim_bridge_node as a robot: Twist alone, time-outs, episodes, and parity with NavigationEnv."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import rclpy
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from ros_harness import child, wait_until, write_checkpoint
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from vn_msgs_py.images import decode_rgb
+from vn_msgs_py.motion import odometry_to_array
+from vn_nav.bags.reader import read_bag
+from vn_nav.evaluation.bag_episodes import drives_from_bag
+from vn_nav.nodes.qos import qos
+from vn_nav.resources import share_file
+from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.tasks import wrap_angle
+
+pytestmark = pytest.mark.ros
+
+
+class Listener:
+    """Hears what a robot publishes, and can send any Twist."""
+
+    def __init__(self):
+        self.node = rclpy.create_node('listener')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.heard = {}
+        for name, kind in (('odom', Odometry), ('ground_truth/odom', Odometry),
+                           ('image_raw', Image), ('goal_image', Image), ('scene', String),
+                           ('episode', String), ('camera_info', CameraInfo)):
+            self.heard[name] = []
+            self.node.create_subscription(kind, name, self.heard[name].append, qos(name, depth=50))
+        self.command = self.node.create_publisher(Twist, 'cmd_vel', qos('cmd_vel'))
+
+    def spin(self):
+        self.executor.spin_once(timeout_sec=0.01)
+
+    def pause(self, seconds):
+        end = time.monotonic() + seconds
+        wait_until(lambda: time.monotonic() > end, self.spin)
+
+    def pose(self, name='ground_truth/odom'):
+        return odometry_to_array(self.heard[name][-1])
+
+
+@pytest.fixture
+def listener():
+    rclpy.init()
+    listener = Listener()
+    yield listener
+    listener.node.destroy_node()
+    rclpy.shutdown()
+
+
+def test_any_twist_drives_it_and_silence_stops_it(listener, tmp_path):
+    with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7, noise=False):
+        wait_until(lambda: all(listener.heard.values()), listener.spin)
+        scene = json.loads(listener.heard['scene'][0].data)
+        assert scene['house'] == 7 and len(scene['goals']) == 5
+        assert decode_rgb(listener.heard['image_raw'][-1]).shape == (84, 84, 3)
+        assert listener.heard['camera_info'][-1].k[0] == pytest.approx(42.0)  # 90 degrees
+        before = listener.pose()
+        message = Twist()
+        message.angular.z = 0.5
+        for _ in range(20):
+            listener.command.publish(message)
+            listener.pause(0.05)
+        turned = wrap_angle(listener.pose()[2] - before[2])
+        assert 0.35 < turned < 0.6
+        listener.pause(0.8)  # half a second without a command is enough
+        assert listener.pose()[5] == 0.0
+        stands = listener.pose()
+        listener.pause(0.5)
+        assert np.array_equal(listener.pose()[:3], stands[:3])
+        assert wrap_angle(stands[2] - before[2]) < 0.85
+        stamps = [odometry_to_array(m)[6] for m in listener.heard['odom']]
+        assert np.diff(stamps).min() > 0  # time never goes back
+
+
+def test_reset_takes_the_goal_pose_and_refuses_a_wall(listener, tmp_path):
+    with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7):
+        wait_until(lambda: listener.heard['episode'], listener.spin)
+        client = listener.node.create_client(Trigger, '/sim_bridge_node/reset')
+        publisher = listener.node.create_publisher(PoseStamped, 'goal_pose', qos('goal_pose'))
+        wait_until(lambda: client.service_is_ready() and publisher.get_subscription_count(),
+                   listener.spin)
+        goal = json.loads(listener.heard['scene'][0].data)['goals'][2]['pose']
+
+        def reset(x, y):
+            message = PoseStamped()
+            message.pose.position.x, message.pose.position.y = x, y
+            publisher.publish(message)
+            listener.pause(0.3)
+            future = client.call_async(Trigger.Request())
+            wait_until(future.done, listener.spin)
+            return future.result()
+        answer = reset(-5.0, 0.0)
+        assert not answer.success and 'can stand' in answer.message
+        goals = len(listener.heard['goal_image'])
+        assert reset(goal[0], goal[1]).success
+        wait_until(lambda: len(listener.heard['goal_image']) > goals, listener.spin)
+        episode = json.loads(listener.heard['episode'][-1].data)
+        assert episode['goal'] == -1 and episode['goal_pose'][:2] == goal[:2]
+
+
+def test_bad_parameters_are_one_line_and_exit_code_2():
+    for parameter, word in (('backend:=thor', 'backend'), ('house:=-3', 'seed'),
+                            ('time:=yesterday', 'time'), ('rooms:=40', 'rooms')):
+        done = subprocess.run(
+            [sys.executable, '-m', 'vn_sim_bridge.bridge_node', '--ros-args', '-p', parameter],
+            capture_output=True, text=True, timeout=60)
+        assert done.returncode == 2, done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+        assert word in done.stderr
+
+
+def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
+    """The parity test: policy_node and bridge over ROS against NavigationEnv, noise off."""
+    sequences, length = 50, 8
+    checkpoint = write_checkpoint(tmp_path / 'checkpoint')
+    base = str(share_file('config/robots/demo_base.yaml'))
+    with child('vn_nav.nodes.recorder_node', tmp_path / 'recorder.log',
+               output=tmp_path / 'bag') as recorder, \
+         child('vn_sim_bridge.bridge_node', tmp_path / 'bridge.log', house=7, time='lock_step',
+               robot=base, noise=False, seed=5, episodes=sequences, max_decisions=length,
+               exit_when_done=True) as bridge, \
+         child('vn_nav.nodes.policy_node', tmp_path / 'policy.log', checkpoint=checkpoint,
+               time='lock_step', robot=base, auto_enable=True, seed=5) as policy:
+        bridge.wait(100)
+        for process in (policy, recorder):
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
+    drive = drives_from_bag(tmp_path / 'bag')[0]
+    actions = [(record.stamp, record.message.data)
+               for record in read_bag(tmp_path / 'bag', ('action',))]
+    begins = [record.stamp for record in read_bag(tmp_path / 'bag', ('episode',))]
+    assert len(drive.episodes) == sequences
+    env = NavigationEnv(EnvConfig(houses=(7,), num_envs=1, noise=False, max_decisions=1000))
+    env.reset(seed=0)
+    distances, turns = [], []
+    for k, recorded in enumerate(drive.episodes):
+        end = begins[k + 1] if k + 1 < len(begins) else np.inf
+        chosen = [action for stamp, action in actions if begins[k] <= stamp < end]
+        assert len(chosen) == recorded.episode.decisions
+        env.backend.place(np.array([0]), np.array([recorded.facts['start']]))
+        for action in chosen:
+            env.backend.move(env._deltas[[action]])
+        x, y, yaw = recorded.trajectory[-1]
+        distances.append(np.hypot(*(env.backend.poses[0, :2] - (x, y))))
+        turns.append(abs(np.degrees(wrap_angle(env.backend.poses[0, 2] - yaw))))
+    assert max(distances) < 0.02 and max(turns) < 2.0, (max(distances), max(turns))
+    print(f'largest difference {max(distances) * 1000:.2f} mm, {max(turns):.4f} deg')
