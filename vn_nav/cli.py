@@ -178,18 +178,22 @@ def show_results(results: dict, title: str) -> None:
     """Print figures as a table."""
     from rich.console import Console
     from rich.table import Table
-    table = Table(title=title)
-    for heading in ('policy', 'episodes', 'success (95 %)', 'SPL', 'decisions', 'seconds',
-                    'collisions', 'contact-free', 'stop error', 'return'):
-        table.add_column(heading, justify='left' if heading == 'policy' else 'right')
+    count = next(iter(results.values()))['episodes']
+    table = Table(title=f'{title}, {count} episodes each')
+    for heading in ('policy', 'success (95 %)', 'SPL', 'decisions', 'seconds', 'collisions',
+                    'contact-free', 'stop error'):
+        table.add_column(heading, justify='left' if heading == 'policy' else 'right',
+                         no_wrap=True)
     for name, r in results.items():
         low, high = r['success_interval']
-        table.add_row(name, str(r['episodes']), f'{r["success"]:.2f} ({low:.2f}-{high:.2f})',
+        table.add_row(name, f'{r["success"]:.2f} ({low:.2f}-{high:.2f})',
                       f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["seconds"]:.0f}',
                       f'{r["collisions"]:.1%}', f'{r["contact_free_success"]:.2f}',
-                      f'{r["stop_error_m"]:.2f} m {r["stop_error_deg"]:.0f} deg',
-                      f'{r["return"]:.2f}')
-    Console().print(table)
+                      f'{r["stop_error_m"]:.2f} m {r["stop_error_deg"]:.0f} deg')
+    console = Console()
+    if not console.is_terminal:
+        console.width = 120  # a file or a pipe has no width of its own
+    console.print(table)
 
 
 def run_publish(args) -> int:
@@ -217,8 +221,11 @@ def run_publish(args) -> int:
 def run_demo(args) -> int:
     """`vn_nav demo`."""
     from vn_nav.demo import run
-    return run(args.out, make_env=make_env, episodes=args.episodes, unseen_episodes=args.unseen_episodes,
-               checkpoint=args.checkpoint)
+    from vn_nav.resources import share_file
+    folder = args.checkpoint or share_file('models/house')
+    _load(folder)  # refuse before anything is written
+    return run(args.out, folder, make_env=make_env, episodes=args.episodes,
+               unseen_episodes=args.unseen_episodes)
 
 
 def main(argv: list[str] | None = None) -> int:

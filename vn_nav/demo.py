@@ -95,16 +95,16 @@ class Processes:
             self.stop(name)
 
 
-def run(out: Path, *, make_env: Callable, episodes: int = 20, unseen_episodes: int = 10,
-        checkpoint: Path | None = None) -> int:
+def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
+        unseen_episodes: int = 10) -> int:
     """Drive, record, measure, report.
 
     Args:
         out: folder for bag, page and result.json; what an earlier demo left there is replaced.
+        folder: of the checkpoint.
         make_env: (houses, rooms, environments, max_decisions=...) -> vector environment, for the
             random control.
         episodes, unseen_episodes: in the trained and in the unseen house.
-        checkpoint: instead of the shipped policy.
 
     Returns:
         The exit code.
@@ -113,7 +113,6 @@ def run(out: Path, *, make_env: Callable, episodes: int = 20, unseen_episodes: i
         raise UserError('the demo has at least one episode in each house',
                         (episodes, unseen_episodes), 'raise --episodes, --unseen-episodes')
     console = Console()
-    folder = Path(checkpoint) if checkpoint else share_file('models/house')
     loaded = load_checkpoint(folder)
     info = loaded.info
     places = (('trained', info['houses'][0], episodes, TRAINED_LIMIT),

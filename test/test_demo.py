@@ -1,0 +1,86 @@
+"""The demo for real, small: every figure of result.json is counted again from its bag."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from vn_nav.cli import main
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
+
+
+@pytest.fixture(scope='module')
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('demo') / 'out'
+    assert main(['demo', '--out', str(folder), '--episodes', '4', '--unseen-episodes', '2']) == 0
+    return folder
+
+
+def counted(folder):
+    """Episodes by stamps alone, without the code that made result.json."""
+    begins, ends, rewards, touches, poses = [], [], [], [], []
+    with AnyReader([folder]) as reader:
+        for connection, stamp, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            match connection.topic:
+                case '/episode':
+                    begins.append((stamp, json.loads(message.data)))
+                case '/episode_end':
+                    ends.append((stamp, message.data))
+                case '/reward':
+                    rewards.append((stamp, message.data))
+                case '/collision':
+                    touches.append((stamp, message.data))
+                case '/ground_truth/odom':
+                    time = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+                    position = message.pose.pose.position
+                    poses.append((time, position.x, position.y))
+    poses = np.array(poses)
+    for k, (stamp, facts) in enumerate(begins):
+        until = begins[k + 1][0] if k + 1 < len(begins) else math.inf
+        end = begins[k + 1][1]['stamp'] if k + 1 < len(begins) else math.inf
+        own = poses[(poses[:, 0] >= facts['stamp'] - 1e-6) & (poses[:, 0] < end - 1e-6)]
+        path = np.hypot(*np.diff(own[:, 1:], axis=0).T).sum()
+        decisions = sum(stamp < s < until + 3e6 for s, _ in rewards) - sum(
+            stamp < s < stamp + 3e6 for s, _ in rewards)
+        collisions = sum(v for s, v in touches if stamp + 3e6 < s < until + 3e6)
+        success = [v for s, v in ends if stamp + 3e6 < s < until + 3e6] == [1]
+        shortest = max(facts['start_distance'] - 0.6, 0)
+        yield facts['max_decisions'], success, decisions, collisions, (
+            success * shortest / max(path, shortest, 1e-9))
+
+
+def test_every_figure_is_in_the_bag(demo):
+    result = json.loads((demo / 'result.json').read_text())
+    assert set(result) >= {'trained', 'unseen', 'seconds', 'bag', 'html'}
+    episodes = list(counted(demo / result['bag']))
+    for place, limit, count in (('trained', 300, 4), ('unseen', 100, 2)):
+        own = [e for e in episodes if e[0] == limit]
+        figures = result[place]
+        assert len(own) == figures['episodes'] == count
+        assert figures['success'] == pytest.approx(np.mean([e[1] for e in own]))
+        assert figures['spl'] == pytest.approx(np.mean([e[4] for e in own]), abs=1e-6)
+        assert figures['collisions'] == pytest.approx(
+            sum(e[3] for e in own) / sum(e[2] for e in own))
+        assert figures['random']['episodes'] == count
+
+
+def test_the_page_is_whole_and_needs_nothing_else(demo):
+    page = (demo / 'report.html').read_text()
+    assert page.count('<svg') == 2 and page.count('data:image/png') > 10
+    assert '<script' not in page and 'src="http' not in page and '<link' not in page
+    assert 'nan' not in page.split('<table>')[1].lower()
+
+
+def test_the_bridges_own_account_agrees(demo):
+    """Cross-check: what the simulator says of each episode, against what the bag shows."""
+    own = []
+    with AnyReader([demo / 'bag']) as reader:
+        wanted = [c for c in reader.connections if c.topic == '/episode_result']
+        for connection, _, data in reader.messages(connections=wanted):
+            own.append(json.loads(reader.deserialize(data, connection.msgtype).data))
+    for said, seen in zip(own, counted(demo / 'bag'), strict=True):
+        assert (said['success'], said['decisions'], said['collisions']) == seen[1:4]
