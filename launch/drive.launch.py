@@ -54,8 +54,9 @@ def generate_launch_description():
         namespace=LaunchConfiguration('namespace'),
         parameters=[
             LaunchConfiguration('params_file'),
+            # The events below bring the node up; its own autostart would do it a second time.
             {'use_sim_time': ParameterValue(
-                LaunchConfiguration('use_sim_time'), value_type=bool)},
+                LaunchConfiguration('use_sim_time'), value_type=bool), 'autostart': False},
         ],
         arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
         respawn=LaunchConfiguration('use_respawn'),
