@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vn_nav.policy.motion import ActionExecutor, cruise, ramp
-from vn_nav.robot import THESIS_ACTIONS, RobotSpec, load_robot
 from vn_nav.resources import share_file
+from vn_nav.robot import THESIS_ACTIONS, RobotSpec, load_robot
 
 DT = 0.05
 SLOW = RobotSpec()

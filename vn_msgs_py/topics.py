@@ -10,7 +10,7 @@ VOLATILE, LATCHED = 'volatile', 'transient_local'
 
 @dataclasses.dataclass(frozen=True)
 class Topic:
-    """One topic. Quality of service as in REP 2003: sensors best effort, latched facts reliable."""
+    """One topic. Quality of service follows REP 2003: sensors best effort, facts latched."""
 
     name: str
     type: str
@@ -47,8 +47,8 @@ TOPICS = (
     _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),
     _sensor('labels/image_raw', _IMAGE, 'bridge', 'mono8 class ids'),
     _latched('labels/names', _STRING, 'bridge', 'JSON list: the names behind the class ids'),
-    Topic('collision', 'std_msgs/msg/Bool', 'bridge', 'at a decision\'s end: it touched something'),
-    Topic('reward', 'std_msgs/msg/Float32', 'bridge', 'at a decision\'s end: 1 on arrival, else 0'),
+    Topic('collision', 'std_msgs/msg/Bool', 'bridge', "at a decision's end: it touched something"),
+    Topic('reward', 'std_msgs/msg/Float32', 'bridge', "at a decision's end: 1 on arrival, else 0"),
     Topic('episode_end', 'std_msgs/msg/UInt8', 'bridge', '1 terminated, 2 truncated'),
     Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
           'true pose in the map, for evaluation; the policy never reads it', depth=200),
@@ -56,7 +56,7 @@ TOPICS = (
     _latched('episode', _STRING, 'bridge', 'JSON: goal and start of the present episode'),
     Topic('episode_result', _STRING, 'bridge', 'JSON: outcome of the episode that ended'),
     Topic('goal_pose', 'geometry_msgs/msg/PoseStamped', 'user',
-          'a goal by pose; taken by the bridge\'s ~/reset', depth=1),
+          "a goal by pose; taken by the bridge's ~/reset", depth=1),
     _sensor('/clock', 'rosgraph_msgs/msg/Clock', 'bridge', 'simulated time'),
 )
 

@@ -177,7 +177,7 @@ def _drive(console: Console, processes: Processes, checkpoint: Path, place: str,
                 break
             if time.monotonic() - progress > STALL:
                 words = (processes.log(policy).strip().splitlines() or ['nothing'])[-1]
-                raise ProcessFailure(f'no episode ended for {STALL:.0f} s; the policy\'s last '
+                raise ProcessFailure(f"no episode ended for {STALL:.0f} s; the policy's last "
                                      f'words: {words}')
             time.sleep(0.1)
     processes.stop(policy)

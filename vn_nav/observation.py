@@ -19,7 +19,7 @@ class Observation(NamedTuple):
     """What the network may see (and nothing else). Leading dimensions are [T,B] or [B]."""
 
     image: Any  # [...,3,H,W] uint8 RGB
-    goals: Any  # [G,3,H,W] uint8, the distinct goals of this batch; None for tasks without a picture
+    goals: Any  # [G,3,H,W] uint8, the distinct goals of this batch; None: a task without
     goal_index: Any  # [...] int64 into goals: each goal is kept, and encoded, once
     last_action: Any  # [...] int64, -1 at an episode's start
     last_reward: Any  # [...] float32, the sparse task reward only
@@ -40,7 +40,7 @@ def preprocess(image: np.ndarray, size: int, *, fov: float | None = None,
         [3,size,size] uint8 RGB, contiguous.
 
     Raises:
-        UserError: a wrong shape or type, or a camera narrower than the network's (by more than 2 %).
+        UserError: a wrong shape or type, or a camera narrower than the network's by over 2 %.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise UserError('a picture is uint8 [H,W,3]', f'{image.dtype} {image.shape}',
@@ -69,5 +69,5 @@ def crop_fraction(fov: float, target_fov: float) -> float:
         raise UserError(
             f'the camera sees at least the {math.degrees(target_fov):.0f} deg that the policy was '
             'trained with', f'{math.degrees(fov):.0f} deg on its shorter side',
-            'use a wider lens, or train a policy for this camera (config/robots/*.yaml, camera_fov)')
+            'use a wider lens, or train a policy for this camera (camera_fov of the robot)')
     return min(fraction, 1.0)

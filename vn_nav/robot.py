@@ -17,7 +17,7 @@ from vn_nav.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Action:
-    """One discrete action: a displacement of the base (or of the camera's tilt) in its own frame."""
+    """One discrete action: a displacement of the base, or of the camera's tilt."""
 
     name: str
     dx: float = 0.0  # m, forward
@@ -34,7 +34,8 @@ class Action:
                 'split it into several actions',
             )
         if not math.isfinite(getattr(self, moved[0])):
-            raise UserError('an action is finite', dataclasses.asdict(self), 'correct the robot file')
+            raise UserError('an action is finite', dataclasses.asdict(self),
+                            'correct the robot file')
 
     @property
     def axis(self) -> str:
@@ -121,7 +122,7 @@ class RobotSpec:
     def nominal_duration(self, action: int) -> float:
         """Seconds that an action takes from rest to rest under the robot's limits.
 
-        A trapezoidal profile, or a triangular one where the action is too short to reach the limit.
+        A trapezoidal profile, or a triangular one where an action is too short for the limit.
         """
         size = abs(self.actions[action].size)
         axis = self.actions[action].axis

@@ -39,7 +39,7 @@ class EnvConfig:
     progress_reward: float = 0.0  # per metre of geodesic progress
     collision_reward: float = 0.0  # per decision that touched something; a penalty is negative
     min_start_distance: float = 1.0  # m, geodesic
-    one_goal_per_env: bool = False  # environment i keeps scene-goal pair i; else drawn each episode
+    one_goal_per_env: bool = False  # environment i keeps pair i; else drawn each episode
     seed: int = 0
     privileged: tuple[str, ...] = ()  # of PRIVILEGED
 
@@ -66,7 +66,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     [G,3,H,W] uint8; the last one, `blank_goal`, is plain grey.
 
     Autoreset is NEXT_STEP: the step after an episode's end ignores its action and returns the new
-    episode's first observation with reward 0; `info['reset']` marks such rows, which are no frames.
+    episode's first observation with reward 0; `info['reset']` marks these rows: no frames.
 
     Args:
         config: what to simulate.
@@ -170,7 +170,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if actions.shape != (self.num_envs,) or actions.min() < 0 or (
                 actions.max() >= len(self.action_names)):
             raise UserError(f'actions are {self.num_envs} integers from 0 to '
-                            f'{len(self.action_names) - 1}', actions.tolist(), 'pass such an array')
+                            f'{len(self.action_names) - 1}', actions.tolist(),
+                            'pass such an array')
         reset = self._done.copy()
         acting = np.nonzero(~reset)[0]
         collided = np.zeros(self.num_envs, bool)
@@ -271,7 +272,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """The next action [N] on a shortest path to the goal pose, from the simulator's geometry.
 
         Far from the goal: the heading, among those that rotations reach, whose forward move comes
-        closest to the goal, charging `TURN_COST` for each rotation and `BLOCKED_COST` for contacts.
+        closest to the goal, charging `TURN_COST` a rotation and `BLOCKED_COST` for contacts.
         At the goal: turn to its yaw.
         """
         table = {name: index for index, name in enumerate(self.action_names)}

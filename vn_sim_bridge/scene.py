@@ -39,7 +39,7 @@ class Scene:
 
 
 class SceneBuilder:
-    """Collects polygons, group by group. Lighting is one lamp direction, baked into the colours."""
+    """Collects polygons, group by group. Light by facing is baked into the colours."""
 
     # Light that a surface receives by the direction it faces: +x, -x, +y, -y, up, down. Six
     # different values let a viewer, and a network, tell walls apart.

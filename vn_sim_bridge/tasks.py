@@ -1,4 +1,4 @@
-"""Image-goal navigation as pure functions: where episodes start, what success is, what it earns."""
+"""Image-goal navigation as pure functions: starts, success, rewards."""
 
 from __future__ import annotations
 

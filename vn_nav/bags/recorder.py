@@ -67,6 +67,7 @@ class BagWriter:
 def _quality(topic: Topic) -> Qos:
     return Qos(
         QosHistory.KEEP_LAST, topic.depth,
-        QosReliability.BEST_EFFORT if topic.reliability == BEST_EFFORT else QosReliability.RELIABLE,
+        (QosReliability.BEST_EFFORT if topic.reliability == BEST_EFFORT
+         else QosReliability.RELIABLE),
         QosDurability.TRANSIENT_LOCAL if topic.durability == LATCHED else QosDurability.VOLATILE,
         _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, False)

@@ -25,7 +25,8 @@ STYLE = """
   --paper:#14181f; --card:#1b2029; --good:#46c394; --bad:#f08a5d; --wall:#aab4c2; --wood:#3d3a33;
   --floor:#222832; --goal:#7da7f7 } }
 * { box-sizing:border-box } body { margin:0; background:var(--paper); color:var(--ink);
-  font:16px/1.55 system-ui, sans-serif } main { max-width:1080px; margin:0 auto; padding:48px 24px }
+  font:16px/1.55 system-ui, sans-serif } main { max-width:1080px;
+  margin:0 auto; padding:48px 24px }
 h1 { font-size:2.1rem; line-height:1.2; margin:0 0 .3em; letter-spacing:-.02em }
 h2 { margin:2.4em 0 .2em; font-size:1.45rem; letter-spacing:-.01em } p { max-width:68ch }
 .soft, small, figcaption { color:var(--soft) } .cards { display:flex; gap:14px; flex-wrap:wrap;
@@ -67,7 +68,8 @@ and its own last action; no map, no pose, no depth.</p>
 {body}
 <h2>What the words mean</h2><dl>
 <dt>Success</dt><dd>At the end of a decision the robot stands within 0.6 m of the place (driving
-distance) and faces within 30 degrees of the picture's direction. In brackets the 95 % interval.</dd>
+distance) and faces within 30 degrees of the picture's direction. In brackets the 95 %
+interval.</dd>
 <dt>SPL</dt><dd>Success weighted by path length: 1 means that every journey succeeded on the
 shortest way.</dd>
 <dt>Collisions</dt><dd>Share of decisions that touched something. The robot does not slide along
@@ -114,7 +116,8 @@ not.</figcaption></figure>
 
 def _row(recorded: RecordedEpisode) -> str:
     e = recorded.episode
-    outcome = '<span class="yes">arrived</span>' if e.success else '<span class="no">gave up</span>'
+    kind, words = ('yes', 'arrived') if e.success else ('no', 'gave up')
+    outcome = f'<span class="{kind}">{words}</span>'
     return (f'<tr><td>{recorded.facts["episode"] + 1}</td><td>{html.escape(e.goal)}</td>'
             f'<td>{outcome}</td><td>{e.start_distance:.1f}</td><td>{e.path_length:.1f}</td>'
             f'<td>{path_efficiency(e):.2f}</td><td>{e.decisions}</td><td>{e.collisions}</td>'

@@ -60,7 +60,7 @@ PARAMETERS = {
     'max_frame_age': (0.25, 'older frames are dropped [s]', (0.02, 5.0)),
     'max_frame_ahead': (0.05, 'frames stamped later than now are dropped [s]', (0.0, 5.0)),
     'inference_timeout': (0.1, 'later decisions are discarded [s]', (0.005, 2.0)),
-    'settle_time': (0.1, 'from a motion\'s last command to a frame at rest [s]', (0.0, 2.0)),
+    'settle_time': (0.1, "from a motion's last command to a frame at rest [s]", (0.0, 2.0)),
 }
 
 
@@ -357,7 +357,8 @@ class PolicyNode(LifecycleNode):
             values['cmd_vel'] = mismatch
             level = DiagnosticStatus.ERROR
         status = DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(), hardware_id=self.navigator.robot.name,
+            level=level, name=self.get_fully_qualified_name(),
+            hardware_id=self.navigator.robot.name,
             message=mismatch or f'{state.value}: {reason}' if reason or mismatch else state.value,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
         message = DiagnosticArray(status=[status])
@@ -477,13 +478,10 @@ class PolicyNode(LifecycleNode):
         answered, moving, first = self._odometry_count, False, False
         while True:
             with self._wake:
-                self._wake.wait_for(
-                    lambda: not self._running or self._odometry_count > answered
-                    or (not moving and self.navigator.ready_to_move), timeout=0.5)
+                self._wait_for_odometry(answered, or_decision=not moving, timeout=0.5)
                 if first and self._odometry_rests and self._odometry_count > answered:
-                    answered = self._odometry_count
-                    self._wake.wait_for(lambda: not self._running
-                                        or self._odometry_count > answered, timeout=CROSSING)
+                    self._wait_for_odometry(self._odometry_count, or_decision=False,
+                                            timeout=CROSSING)
                 if not self._running:
                     return
                 answered = self._odometry_count
@@ -493,6 +491,11 @@ class PolicyNode(LifecycleNode):
                 moving, first = moved, moved and not moving
             if velocity is not None:
                 self._send(velocity)
+
+    def _wait_for_odometry(self, answered: int, *, or_decision: bool, timeout: float) -> None:
+        self._wake.wait_for(
+            lambda: not self._running or self._odometry_count > answered
+            or (or_decision and self.navigator.ready_to_move), timeout=timeout)
 
     def _send(self, velocity: np.ndarray) -> None:
         if self.stamped:

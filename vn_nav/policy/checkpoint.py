@@ -137,7 +137,8 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
     except TypeError as error:
         known = ', '.join(field.name for field in dataclasses.fields(NetworkConfig))
         raise UserError(f'the network in {CONFIG} has only the fields {known}',
-                        f'{where}: {error}', 'use the version of vn_nav that wrote it, or train again') from error
+                        f'{where}: {error}', 'use the version of vn_nav that wrote it, or '
+                        'train again') from error
     if expect_actions is not None and tuple(expect_actions) != network_config.actions:
         raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
                         ', '.join(network_config.actions), 'use a checkpoint trained for them')

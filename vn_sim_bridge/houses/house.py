@@ -84,7 +84,7 @@ class FloorMap(NamedTuple):
     """A grid of cells; cell [i, j] has its centre at origin + ((j + 0.5), (i + 0.5)) * CELL."""
 
     origin: tuple[float, float]
-    free: np.ndarray  # [rows, columns] bool: the robot can stand here, and reach it from everywhere
+    free: np.ndarray  # [rows, columns] bool: the robot can stand here, and get here
 
     def centres(self) -> np.ndarray:
         """[K,2] positions of the free cells [m], in row order."""
@@ -108,7 +108,8 @@ def clearance(origin: tuple[float, float], shape: tuple[int, int],
 
 def grid_of(outline: Rect) -> tuple[tuple[float, float], tuple[int, int]]:
     """Origin and shape of the floor map of an outline."""
-    shape = (math.ceil((outline.y1 - outline.y0) / CELL), math.ceil((outline.x1 - outline.x0) / CELL))
+    shape = (math.ceil((outline.y1 - outline.y0) / CELL),
+             math.ceil((outline.x1 - outline.x0) / CELL))
     return (outline.x0, outline.y0), shape
 
 

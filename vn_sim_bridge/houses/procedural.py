@@ -222,7 +222,8 @@ class _Construction:
     def _try_piece(self, index: int, name: str) -> bool:
         """Put a piece at a random place along a random wall; False when it does not fit."""
         room, kind = self.rooms[index], KINDS[name]
-        width, depth, height = (self.rng.uniform(*r) for r in (kind.width, kind.depth, kind.height))
+        width, depth, height = (self.rng.uniform(*span)
+                                for span in (kind.width, kind.depth, kind.height))
         quarter = int(self.rng.integers(4))
         gap = 0.01
         # Quarter 0 stands at the south wall and faces north; each further one turns left.

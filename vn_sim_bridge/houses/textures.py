@@ -156,7 +156,7 @@ def texture_library() -> np.ndarray:
     """All textures with their mip chains.
 
     Returns:
-        [n_textures, texels, 3] uint8; a chain is the levels 64 x 64, 32 x 32, ... one after another.
+        [n_textures, texels, 3] uint8; a chain is 64 x 64, 32 x 32, ... one after another.
     """
     chains = []
     for index, recipe in enumerate(_RECIPES.values()):

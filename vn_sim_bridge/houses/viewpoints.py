@@ -27,7 +27,8 @@ def choose_goals(scene: Scene, rooms: list[Room], floor: FloorMap, rng: np.rando
     goals = []
     for room in rooms:
         x0, y0, x1, y1 = room.rect
-        inside = centres[(centres[:, 0] > x0 + WALL_DISTANCE) & (centres[:, 0] < x1 - WALL_DISTANCE)
+        inside = centres[(centres[:, 0] > x0 + WALL_DISTANCE)
+                         & (centres[:, 0] < x1 - WALL_DISTANCE)
                          & (centres[:, 1] > y0 + WALL_DISTANCE)
                          & (centres[:, 1] < y1 - WALL_DISTANCE)]
         if len(inside) == 0:
