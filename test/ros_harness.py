@@ -43,7 +43,7 @@ def child(module, log, **parameters):
             process.wait()
 
 
-def wait_until(condition, spin, seconds=20.0):
+def wait_until(condition, spin, seconds=60.0):
     """Call `spin` until the condition holds; the seconds it took."""
     begun = time.monotonic()
     while not condition():

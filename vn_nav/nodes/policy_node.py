@@ -17,10 +17,9 @@ import time
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -32,6 +31,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from vn_msgs_py import images, motion
 from vn_nav.errors import UserError
+from vn_nav.nodes import policy_parameters
+from vn_nav.nodes.diagnosis import Diagnosis
 from vn_nav.nodes.qos import qos
 from vn_nav.observation import crop_fraction, preprocess
 from vn_nav.policy.navigator import Limits, Navigator, State
@@ -42,28 +43,6 @@ from vn_nav.robot import RobotSpec, load_robot
 LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step
 CROSSING = 0.03  # s of wall time, see _output_lock_step
 
-# name: (default, meaning, range or None). Ranges are [least, most] in the parameter's unit.
-PARAMETERS = {
-    'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),
-    'robot': ('', 'YAML file of the robot; empty: the standard robot', None),
-    'mode': ('stop_and_go', 'stop_and_go, or continuous: a decision at every frame', None),
-    'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step', None),
-    'image_transport': ('raw', 'raw, or compressed: image_raw/compressed', None),
-    'enable_stamped_cmd_vel': (False, 'publish TwistStamped instead of Twist', None),
-    'autostart': (True, 'configure and activate at the start', None),
-    'auto_enable': (False, 'enable motion as soon as it is possible (simulators only)', None),
-    'seed': (0, 'of the sampled actions', None),
-    'decoding': ('', 'sample or greedy; empty: as the checkpoint was measured', None),
-    'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
-    'frame_timeout': (0.25, 'camera silence after which the robot stands still [s]', (0.05, 5.0)),
-    'frame_stop_timeout': (1.0, 'camera silence that latches a stop [s]', (0.1, 10.0)),
-    'max_frame_age': (0.25, 'older frames are dropped [s]', (0.02, 5.0)),
-    'max_frame_ahead': (0.05, 'frames stamped later than now are dropped [s]', (0.0, 5.0)),
-    'inference_timeout': (0.1, 'later decisions are discarded [s]', (0.005, 2.0)),
-    'settle_time': (0.1, "from a motion's last command to a frame at rest [s]", (0.0, 2.0)),
-}
-
-
 def _seconds(stamp) -> float:
     return stamp.sec + stamp.nanosec * 1e-9
 
@@ -73,10 +52,7 @@ class PolicyNode(LifecycleNode):
 
     def __init__(self):
         super().__init__('policy_node')
-        for name, (default, meaning, span) in PARAMETERS.items():
-            ranges = [FloatingPointRange(from_value=span[0], to_value=span[1])] if span else []
-            self.declare_parameter(name, default, ParameterDescriptor(
-                description=meaning, floating_point_range=ranges))
+        policy_parameters.declare(self)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._wake = threading.Condition()  # guards everything below, and wakes both threads
@@ -91,13 +67,12 @@ class PolicyNode(LifecycleNode):
         self._odometry_rests = True
         self._odometry_received = -math.inf
         self._odometry_count = 0
-        self._last_diagnosis: tuple | None = None
         self.failure = ''
 
     def _on_parameters(self, parameters) -> SetParametersResult:
         """Operation is fixed while active: a limit must not move under a moving robot."""
         for parameter in parameters:
-            if parameter.name in PARAMETERS and self._running:
+            if parameter.name in policy_parameters.PARAMETERS and self._running:
                 return SetParametersResult(successful=False, reason=(
                     f'{parameter.name} is fixed while the node is active; received '
                     f'{parameter.value!r}; deactivate first'))
@@ -124,14 +99,7 @@ class PolicyNode(LifecycleNode):
             self.get_logger().error(reason)
 
     def _configure(self) -> None:
-        value = {name: self.get_parameter(name).value for name in PARAMETERS}
-        for name, allowed in (('mode', ('stop_and_go', 'continuous')),
-                              ('time', ('real_time', 'lock_step')),
-                              ('image_transport', ('raw', 'compressed')),
-                              ('decoding', ('', 'sample', 'greedy'))):
-            if value[name] not in allowed:
-                raise UserError(f'{name} is one of {", ".join(a or "(empty)" for a in allowed)}',
-                                value[name], f'set it with -p {name}:=...')
+        value = policy_parameters.read(self)
         self.lock_step = value['time'] == 'lock_step'
         self.auto_enable = value['auto_enable']
         robot = load_robot(value['robot']) if value['robot'] else RobotSpec()
@@ -154,8 +122,7 @@ class PolicyNode(LifecycleNode):
         self._command = self.create_publisher(kind, 'cmd_vel', qos('cmd_vel'))
         self._action = self.create_publisher(Int8, 'action', qos('action'))
         self._action_names = self.create_publisher(String, 'action_names', qos('action_names'))
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics',
-                                                  qos('/diagnostics'))
+        self._diagnosis = Diagnosis(self, self._command, self.navigator.robot.name)
         image = 'image_raw/compressed' if compressed else 'image_raw'
         self._interfaces = [
             (self.destroy_subscription, self.create_subscription(
@@ -171,7 +138,7 @@ class PolicyNode(LifecycleNode):
             (self.destroy_service, self.create_service(Trigger, '~/reset', self._on_reset)),
             (self.destroy_timer, self.create_timer(0.25, self._on_timer, clock=self._steady)),
             *((self.destroy_publisher, publisher) for publisher in (
-                self._command, self._action, self._action_names, self._diagnostics)),
+                self._command, self._action, self._action_names, self._diagnosis.publisher)),
         ]
         self._action_names.publish(String(data=json.dumps(list(self.runtime.action_names))))
 
@@ -336,43 +303,11 @@ class PolicyNode(LifecycleNode):
             return
         with self._wake:
             state, reason = self.navigator.state, self.navigator.reason
-            decisions, dropped = self.navigator.decisions, dict(self.navigator.dropped)
-        now = time.monotonic()
-        if self._last_diagnosis and self._last_diagnosis[:2] == (state, reason) and (
-                now - self._last_diagnosis[2] < 0.95):
-            return
-        if state is State.STOPPED and (not self._last_diagnosis
-                                       or self._last_diagnosis[:2] != (state, reason)):
-            self.get_logger().error(f'stopped: {reason}; ~/reset, then ~/enable to go on')
-        self._last_diagnosis = (state, reason, now)
-        level = {State.STOPPED: DiagnosticStatus.ERROR, State.HOLD: DiagnosticStatus.WARN}.get(
-            state, DiagnosticStatus.OK)
-        values = {'state': state.value, 'reason': reason, 'decisions': decisions,
-                  'camera_fov_deg': round(math.degrees(self._camera_fov), 1)
-                  if self._camera_fov else 'unknown',
-                  'listeners_on_cmd_vel': self._command.get_subscription_count(),
-                  **{f'dropped: {why}': count for why, count in dropped.items()}}
-        mismatch = self._mismatched_listeners()
-        if mismatch:
-            values['cmd_vel'] = mismatch
-            level = DiagnosticStatus.ERROR
-        status = DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(),
-            hardware_id=self.navigator.robot.name,
-            message=mismatch or f'{state.value}: {reason}' if reason or mismatch else state.value,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
-
-    def _mismatched_listeners(self) -> str:
-        """Twist meets TwistStamped: the robot would stand still without a word."""
-        mine = 'geometry_msgs/msg/' + ('TwistStamped' if self.stamped else 'Twist')
-        for info in self.get_subscriptions_info_by_topic(self._command.topic_name):
-            if info.topic_type != mine:
-                return (f'{info.node_name} listens for {info.topic_type} where this node sends '
-                        f'{mine}: set enable_stamped_cmd_vel to {not self.stamped}')
-        return ''
+            values = {'decisions': self.navigator.decisions,
+                      'camera_fov_deg': round(math.degrees(self._camera_fov), 1)
+                      if self._camera_fov else 'unknown',
+                      **{f'dropped: {why}': n for why, n in self.navigator.dropped.items()}}
+        self._diagnosis.publish(state, reason, values)
 
     # The worker: decodes every admitted frame, and infers when a decision is wanted.
 

@@ -1,0 +1,57 @@
+"""The parameters of policy_node: declared with type, meaning and range; checked when read."""
+
+from __future__ import annotations
+
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+
+from vn_nav.errors import UserError
+
+# name: (default, meaning, range or None). Ranges are [least, most] in the parameter's unit.
+PARAMETERS = {
+    'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),
+    'robot': ('', 'YAML file of the robot; empty: the standard robot', None),
+    'mode': ('stop_and_go', 'stop_and_go, or continuous: a decision at every frame', None),
+    'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step', None),
+    'image_transport': ('raw', 'raw, or compressed: image_raw/compressed', None),
+    'enable_stamped_cmd_vel': (False, 'publish TwistStamped instead of Twist', None),
+    'autostart': (True, 'configure and activate at the start', None),
+    'auto_enable': (False, 'enable motion as soon as it is possible (simulators only)', None),
+    'seed': (0, 'of the sampled actions', None),
+    'decoding': ('', 'sample or greedy; empty: as the checkpoint was measured', None),
+    'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
+    'frame_timeout': (0.25, 'camera silence after which the robot stands still [s]', (0.05, 5.0)),
+    'frame_stop_timeout': (1.0, 'camera silence that latches a stop [s]', (0.1, 10.0)),
+    'max_frame_age': (0.25, 'older frames are dropped [s]', (0.02, 5.0)),
+    'max_frame_ahead': (0.05, 'frames stamped later than now are dropped [s]', (0.0, 5.0)),
+    'inference_timeout': (0.1, 'later decisions are discarded [s]', (0.005, 2.0)),
+    'settle_time': (0.1, "from a motion's last command to a frame at rest [s]", (0.0, 2.0)),
+}
+
+CHOICES = {
+    'mode': ('stop_and_go', 'continuous'),
+    'time': ('real_time', 'lock_step'),
+    'image_transport': ('raw', 'compressed'),
+    'decoding': ('', 'sample', 'greedy'),
+}
+
+
+def declare(node) -> None:
+    """Declare all parameters on a node."""
+    for name, (default, meaning, span) in PARAMETERS.items():
+        ranges = [FloatingPointRange(from_value=span[0], to_value=span[1])] if span else []
+        node.declare_parameter(name, default, ParameterDescriptor(
+            description=meaning, floating_point_range=ranges))
+
+
+def read(node) -> dict:
+    """All values by name.
+
+    Raises:
+        UserError: a word that is none of the choices.
+    """
+    values = {name: node.get_parameter(name).value for name in PARAMETERS}
+    for name, allowed in CHOICES.items():
+        if values[name] not in allowed:
+            raise UserError(f'{name} is one of {", ".join(a or "(empty)" for a in allowed)}',
+                            values[name], f'set it with -p {name}:=...')
+    return values
