@@ -69,6 +69,22 @@ def test_equal_seeds_repeat_and_resets_without_seed_go_on():
     assert np.array_equal(first['image'], again['image'])
 
 
+def test_a_saved_state_goes_on_as_if_nothing_had_happened():
+    env, other = make(max_decisions=15), make(max_decisions=15)
+    env.reset(seed=4)
+    act = random_actions(env)
+    for _ in range(20):
+        env.step(act())
+    other.reset(seed=9)
+    other.set_state(env.get_state())
+    for _ in range(30):
+        actions = act()
+        one, two = env.step(actions), other.step(actions)
+        assert np.array_equal(one[0]['image'], two[0]['image'])
+        for part in (1, 2, 3):
+            assert np.array_equal(one[part], two[part])
+
+
 def test_next_step_autoreset():
     env = make(max_decisions=3)
     env.reset(seed=0)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import signal
 
 import numpy as np
 import pytest
@@ -236,6 +237,23 @@ def test_equal_seeds_give_equal_trainings(tmp_path):
                        info=FACTS)
         weights.append(load_checkpoint(folder).network.state_dict())
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path):
+    """Bit for bit, on one thread: the schedule's end is the same, only the process is not."""
+    config = dataclasses.replace(QUICK, bf16=False, frames=1500)
+    whole = train(make_env(), config, tmp_path / 'whole', info=FACTS)
+    updates = []
+
+    def interrupt(row):
+        updates.append(row)
+        if len(updates) == 5:
+            signal.raise_signal(signal.SIGTERM)
+    train(make_env(), config, tmp_path / 'parts', info=FACTS, on_update=interrupt)
+    assert len(updates) == 5 and updates[-1]['frames'] < 1500
+    parts = train(make_env(), config, tmp_path / 'parts', info=FACTS, resume=True)
+    one, two = (load_checkpoint(folder).network.state_dict() for folder in (whole, parts))
+    assert all(torch.equal(one[name], two[name]) for name in one)
 
 
 @pytest.mark.timeout(200)

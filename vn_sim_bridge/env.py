@@ -154,6 +154,21 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                             self.config.rooms, 'use more rooms')
         self._shown = mode
 
+    _STATE = ('_episode', '_step', '_goal', '_shown_goal', '_distance', '_start_distance',
+              '_path_length', '_last_action', '_last_reward', '_done')
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that changes from step to step; with equal switches `set_state` goes on."""
+        return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed),
+                **{name.strip('_'): getattr(self, name).copy() for name in self._STATE}}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Stand where `get_state` was taken."""
+        self._seed = int(state['seed'])
+        self.backend.place(np.arange(self.num_envs), state['poses'])
+        for name in self._STATE:
+            getattr(self, name)[:] = state[name.strip('_')]
+
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start a new episode everywhere; a seed also restarts the count of episodes."""
         if seed is not None:
