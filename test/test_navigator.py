@@ -205,6 +205,19 @@ def test_stop_is_immediate_even_in_motion(rig):
     assert np.array_equal(rig.step(), np.zeros(4))
 
 
+def test_nobody_drives_blind_when_odometry_falls_silent(rig):
+    rig.arm()
+    rig.now += DT
+    assert not rig.navigator.step(rig.now, DT, ODOMETRY, rig.now, odometry_lost=True).any()
+    assert rig.navigator.state is State.HOLD and 'odometry' in rig.navigator.reason
+    rig.frame()
+    rig.decide()  # odometry is back
+    assert rig.step().any()
+    rig.now += DT
+    assert not rig.navigator.step(rig.now, DT, ODOMETRY, rig.now, odometry_lost=True).any()
+    assert rig.navigator.state is State.STOPPED and 'odometry' in rig.navigator.reason
+
+
 def test_a_clock_that_goes_back_disarms(rig):
     rig.arm()
     rig.navigator.time_jumped()

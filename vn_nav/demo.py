@@ -228,5 +228,3 @@ def _show(console: Console, result: dict, out: Path) -> None:
     console.print(table)
     console.print(f'page    {out / "report.html"}\nbag     {out / "bag"}\n'
                   f'figures {out / "result.json"}\n{result["seconds"]:.0f} s in all')
-
-

@@ -43,6 +43,7 @@ from vn_nav.robot import RobotSpec, load_robot
 LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step
 CROSSING = 0.03  # s of wall time, see _output_lock_step
 
+
 def _seconds(stamp) -> float:
     return stamp.sec + stamp.nanosec * 1e-9
 
@@ -390,14 +391,11 @@ class PolicyNode(LifecycleNode):
                 if not self._running:
                     return
                 now = time.monotonic()
-                odometry = self._odometry
-                if odometry is not None and now - self._odometry_received > (
-                        self.navigator.limits.frame_timeout):
-                    odometry = None
-                    if self.navigator.executor.action is not None and self._odometry is not None:
-                        self.navigator.stop('odometry fell silent in motion', now)
+                lost = self._odometry is not None and (
+                    now - self._odometry_received > self.navigator.limits.frame_timeout)
                 stamp = self.get_clock().now().nanoseconds * 1e-9
-                velocity = self.navigator.step(now, self.period, odometry, stamp)
+                velocity = self.navigator.step(now, self.period, self._odometry, stamp,
+                                               odometry_lost=lost)
                 self.navigator.velocity_sent = velocity is not None and bool(velocity.any())
             if velocity is not None:
                 self._send(velocity)

@@ -243,20 +243,23 @@ class Navigator:
 
     # Velocities, asked for by the output thread.
 
-    def step(self, now: float, dt: float, odometry: np.ndarray | None,
-             stamp: float) -> np.ndarray | None:
+    def step(self, now: float, dt: float, odometry: np.ndarray | None, stamp: float,
+             *, odometry_lost: bool = False) -> np.ndarray | None:
         """The velocity for the next period, or None to stay silent.
 
         Args:
             now: steady time [s]; dt: length of the period [s].
             odometry: [3] x, y, yaw, or None where there is none.
             stamp: present time in the frames' clock [s].
+            odometry_lost: there was odometry, and it fell silent: nobody drives blind.
         """
+        if odometry_lost and self.executor.action is not None:
+            self.stop('odometry fell silent in motion', now)
         if self.state is State.STOPPED:
             return np.zeros(4) if now - self._stopped_at < STOP_SECONDS else None
         if self.state is State.IDLE:
             return None
-        self._watch(now)
+        self._watch(now, odometry_lost)
         if self.state is not State.RUNNING:
             return np.zeros(4)
         if self._inferring_since is not None and (
@@ -265,8 +268,8 @@ class Navigator:
             return np.zeros(4)
         return self._cruise(dt) if self.continuous else self._stop_and_go(dt, odometry, stamp)
 
-    def _watch(self, now: float) -> None:
-        """Camera silence, and holds whose cause is gone."""
+    def _watch(self, now: float, odometry_lost: bool) -> None:
+        """Silence of camera and odometry, and holds whose cause is gone."""
         silence = now - self._last_frame
         if silence > self.limits.frame_stop_timeout:
             self.stop(f'no camera frame for {self.limits.frame_stop_timeout} s', now)
@@ -274,6 +277,9 @@ class Navigator:
             if self.state is State.RUNNING:
                 self._abandon()
             self.state, self.reason = State.HOLD, 'camera silent'
+        elif odometry_lost:
+            self._abandon()
+            self.state, self.reason = State.HOLD, 'odometry silent'
         elif self.state is State.HOLD and self.goal_ready:
             self.state, self.reason = State.RUNNING, ''
 
