@@ -19,9 +19,9 @@ from rich.live import Live
 from rich.table import Table
 
 from vn_nav.errors import UserError
-from vn_nav.evaluation.bag_episodes import drives_from_bag
+from vn_nav.evaluation.bag_episodes import RecordedEpisode, drives_from_bag
 from vn_nav.evaluation.evaluator import policy_actor, random_actor, run_episodes
-from vn_nav.evaluation.metrics import summarise
+from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.evaluation.report import write_report
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.resources import share_file
@@ -210,8 +210,17 @@ def _results(out: Path, places, checkpoint: LoadedCheckpoint, make_env: Callable
         in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
         result[place] = figures | {'house': house, 'max_decisions': limit,
                                    'random': summarise(control),
-                                   'without_ros': summarise(in_process)}
+                                   'without_ros': summarise(in_process),
+                                   'minus_without_ros': _paired(drive.episodes, in_process)}
     return result
+
+
+def _paired(recorded: list[RecordedEpisode], in_process: list[Episode]) -> dict:
+    """Success over ROS minus success without it, on the same starts, with a 95 % interval."""
+    differences = [float(one.episode.success) - float(two.success)
+                   for one, two in zip(recorded, in_process, strict=True)]
+    return {'success': sum(differences) / len(differences),
+            'interval': list(bootstrap_interval(differences))}
 
 
 def _show(console: Console, result: dict, out: Path) -> None:

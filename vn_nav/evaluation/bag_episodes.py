@@ -121,4 +121,4 @@ def _measure(facts: dict, trajectory: np.ndarray, rewards: list, touched: list,
         path_length=float(np.sum(steps)), decisions=len(rewards), collisions=int(sum(touched)),
         # At the speed of the recorded base; straight-line distance: a bag has no floor map.
         seconds=0.05 * len(trajectory), stop_distance=math.dist(last[:2], goal[:2]),
-        stop_heading=abs(turn), reward=float(sum(rewards)), goal=facts['room'])
+        stop_heading=float(abs(turn)), reward=float(sum(rewards)), goal=facts['room'])
