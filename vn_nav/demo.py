@@ -228,12 +228,13 @@ def _show(console: Console, result: dict, out: Path) -> None:
     for heading in ('house', 'policy', 'episodes', 'success', 'SPL', 'decisions', 'collisions'):
         table.add_column(heading, justify='left' if heading in ('house', 'policy') else 'right')
     for place in ('trained', 'unseen'):
-        for policy, r in (('vn_nav, ROS 2', result[place]),
-                          ('the same without ROS', result[place]['without_ros']),
-                          ('random actions', result[place]['random'])):
+        for policy, r in (('vn_nav on ROS 2', result[place]),
+                          ('without ROS', result[place]['without_ros']),
+                          ('random', result[place]['random'])):
             table.add_row(place, policy, str(r['episodes']), f'{r["success"]:.0%}',
                           f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["collisions"]:.1%}')
     console.print()
     console.print(table)
     console.print(f'page    {out / "report.html"}\nbag     {out / "bag"}\n'
-                  f'figures {out / "result.json"}\n{result["seconds"]:.0f} s in all')
+                  f'figures {out / "result.json"}\n{result["seconds"]:.0f} s in all',
+                  highlight=False)
