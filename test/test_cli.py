@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import cv2
 import pytest
 from ros_harness import write_checkpoint
 
@@ -52,3 +53,13 @@ def test_evaluate_prints_figures(tmp_path, capsys):
                  '--json', str(tmp_path / 'figures.json')]) == 0
     assert 'shortest path' in capsys.readouterr().out
     assert (tmp_path / 'figures.json').exists()
+
+
+def test_house_show_writes_a_picture(tmp_path, capsys):
+    path = tmp_path / 'house.png'
+    assert main(['house', 'show', '--seed', '3', '--rooms', '4', '--out', str(path)]) == 0
+    assert '4 rooms' in capsys.readouterr().out
+    picture = cv2.imread(str(path))
+    assert picture.shape[1] == 1200 and picture.std() > 30
+    assert main(['house', 'show', '--out', str(tmp_path / 'house.txt')]) == 2
+    assert 'received' in capsys.readouterr().err

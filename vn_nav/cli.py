@@ -72,6 +72,14 @@ def build_parser() -> argparse.ArgumentParser:
     publish.add_argument('--unseen', type=int, required=True, help='seed of a held-out house')
     publish.add_argument('--episodes', type=int, default=100)
     publish.set_defaults(run=run_publish)
+
+    house = commands.add_parser('house', help='look at an embedded house')
+    actions = house.add_subparsers(dest='action', required=True, metavar='ACTION')
+    show = actions.add_parser('show', help='write a contact sheet: views and a map')
+    show.add_argument('--seed', type=int, default=7)
+    show.add_argument('--rooms', type=int, default=5)
+    show.add_argument('--out', type=Path, help='picture to write (default house-SEED.png)')
+    show.set_defaults(run=run_house_show)
     return parser
 
 
@@ -226,6 +234,19 @@ def run_demo(args) -> int:
     _load(folder)  # refuse before anything is written
     return run(args.out, folder, make_env=make_env, episodes=args.episodes,
                unseen_episodes=args.unseen_episodes)
+
+
+def run_house_show(args) -> int:
+    """`vn_nav house show`."""
+    from vn_sim_bridge.houses.contact_sheet import write_contact_sheet
+    from vn_sim_bridge.houses.procedural import generate_house
+    house = generate_house(args.seed, rooms=args.rooms)
+    path = args.out or Path(f'house-{args.seed}.png')
+    write_contact_sheet(path, house)
+    print(f'{path}: {len(house.rooms)} rooms, {house.area:.0f} m2, '
+          f'{house.scene.triangle_count} triangles, goals in '
+          f'{", ".join(goal.room for goal in house.goals)}')
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:
