@@ -63,3 +63,32 @@ def test_house_show_writes_a_picture(tmp_path, capsys):
     assert picture.shape[1] == 1200 and picture.std() > 30
     assert main(['house', 'show', '--out', str(tmp_path / 'house.txt')]) == 2
     assert 'received' in capsys.readouterr().err
+
+
+def test_a_policy_for_another_robot(tmp_path, capsys):
+    """Other step sizes, camera and actions: trained, evaluated, and refused on the wrong robot."""
+    robot = tmp_path / 'low.yaml'
+    robot.write_text("""
+name: low
+camera_height: 0.4
+camera_fov_deg: 75
+actions:
+  - {name: forward, dx: 0.25}
+  - {name: rotate_left, dyaw_deg: 20}
+  - {name: rotate_right, dyaw_deg: -20}
+  - {name: look_up, dpitch_deg: -15}
+  - {name: look_down, dpitch_deg: 15}
+""")
+    names = 'forward,rotate_left,rotate_right,look_up,look_down'
+    run_folder = tmp_path / 'run'
+    assert main(['train', '--robot', str(robot), '--actions', names, '--envs', '4', '--size', '36',
+                 '--frames', '200', '--rooms', '2', '--no-tensorboard',
+                 '--out', str(run_folder)]) == 0
+    checkpoint = str(run_folder / 'checkpoint')
+    common = ['evaluate', checkpoint, '--episodes', '4', '--max-decisions', '10']
+    assert main([*common, '--robot', str(robot)]) == 0
+    capsys.readouterr()
+    assert main(common) == 2
+    assert 'camera' in capsys.readouterr().err
+    assert main(['train', '--actions', 'fly,crawl', '--out', str(tmp_path / 'none')]) == 2
+    assert "'fly'" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from vn_nav import __version__
 from vn_nav.errors import UserError
+from vn_nav.robot import DRIVE_ACTIONS
 
 BACKENDS = ('house',)
 
@@ -40,6 +41,8 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument('--frames', type=float, default=1.5e6, help='agent decisions')
     train.add_argument('--minutes', type=float, help='stop after this wall-clock time')
     train.add_argument('--envs', type=int, default=64)
+    train.add_argument('--actions', default=','.join(DRIVE_ACTIONS),
+                       help="names from the robot's table, with commas between")
     train.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
     train.add_argument('--progress-reward', type=float, default=1.0, help='per metre')
     train.add_argument('--collision-reward', type=float, default=-0.02, help='per contact')
@@ -71,6 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     publish.add_argument('target', type=Path, help='for example models/house')
     publish.add_argument('--unseen', type=int, required=True, help='seed of a held-out house')
     publish.add_argument('--episodes', type=int, default=100)
+    publish.add_argument('--robot', type=Path, metavar='YAML', help='that it was trained for')
     publish.set_defaults(run=run_publish)
 
     house = commands.add_parser('house', help='look at an embedded house')
@@ -88,6 +92,8 @@ def _add_world(parser: argparse.ArgumentParser, defaults: bool = True) -> None:
     parser.add_argument('--house', type=int, action='append', metavar='SEED',
                         help='seed of a house; may be given several times')
     parser.add_argument('--rooms', type=int, default=5 if defaults else None)
+    parser.add_argument('--robot', type=Path, metavar='YAML',
+                        help='robot file (config/robots/); default: the standard robot')
     parser.add_argument('--seed', type=int, default=0 if defaults else 10_000)
 
 
@@ -96,11 +102,13 @@ def _check_backend(name: str) -> None:
         raise UserError(f'the backend is one of: {", ".join(BACKENDS)}', name, 'choose one')
 
 
-def make_env(houses, rooms: int, envs: int, threads: int = 1, **options):
-    """A `NavigationEnv` of embedded houses with the standard robot."""
+def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, threads: int = 1,
+             **options):
+    """A `NavigationEnv` of embedded houses; without a robot file with the standard robot."""
+    from vn_nav.robot import load_robot
     from vn_sim_bridge.env import EnvConfig, NavigationEnv
     return NavigationEnv(EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs, **options),
-                         threads=threads)
+                         load_robot(robot) if robot else None, threads=threads)
 
 
 def run_train(args) -> int:
@@ -108,7 +116,8 @@ def run_train(args) -> int:
     _check_backend(args.backend)
     from vn_nav.learning.trainer import TrainConfig, train
     houses = args.house or [0]
-    env = make_env(houses, args.rooms, args.envs, args.threads, size=args.size, seed=args.seed,
+    env = make_env(houses, args.rooms, args.envs, robot=args.robot, threads=args.threads,
+                   size=args.size, seed=args.seed, actions=tuple(args.actions.split(',')),
                    progress_reward=args.progress_reward, collision_reward=args.collision_reward)
     config = TrainConfig(
         frames=int(args.frames), minutes=args.minutes, rollout_length=args.rollout_length,
@@ -140,13 +149,21 @@ def machine() -> str:
     return f'{model}, {os.cpu_count()} cores'
 
 
-def _load(path: Path):
-    """A checkpoint for the present world, with actions of the standard robot."""
+def _load(path: Path, robot: Path | None = None):
+    """A checkpoint for the present world, whose actions and camera the robot has."""
     from vn_nav.policy.checkpoint import load_checkpoint
-    from vn_nav.robot import RobotSpec
+    from vn_nav.robot import RobotSpec, load_robot
     from vn_sim_bridge.world import WORLD_VERSION
     checkpoint = load_checkpoint(path)
-    RobotSpec().with_actions(checkpoint.config.actions)  # or says which action is unknown
+    spec = load_robot(robot) if robot else RobotSpec()
+    spec.with_actions(checkpoint.config.actions)  # or says which action is unknown
+    trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
+    present = math.degrees(spec.camera_fov), spec.camera_height
+    if any(abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
+        raise UserError('the robot has the camera that the policy was trained with: '
+                        f'{trained[0]:g} deg, {trained[1]:g} m high',
+                        f'{present[0]:g} deg, {present[1]:g} m (robot {spec.name})',
+                        'give its file with --robot, or train a policy for this robot')
     if checkpoint.info['world_version'] != WORLD_VERSION:
         raise UserError(f'the checkpoint belongs to world version {WORLD_VERSION!r}',
                         checkpoint.info['world_version'], 'train it again (vn_nav train), or use '
@@ -155,10 +172,11 @@ def _load(path: Path):
 
 
 def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, controls: bool = True,
-            decoding: str | None = None, max_decisions: int = 300) -> dict:
+            decoding: str | None = None, max_decisions: int = 300,
+            robot: Path | None = None) -> dict:
     """Figures of a loaded checkpoint in some houses."""
     from vn_nav.evaluation.evaluator import evaluate
-    env = make_env(houses, rooms, min(50, episodes), size=checkpoint.config.size,
+    env = make_env(houses, rooms, min(50, episodes), robot=robot, size=checkpoint.config.size,
                    actions=checkpoint.config.actions, max_decisions=max_decisions)
     return evaluate(env, checkpoint.network, decoding=decoding or checkpoint.info['decoding'],
                     episodes=episodes, controls=controls, seed=seed)
@@ -169,12 +187,12 @@ def run_evaluate(args) -> int:
     _check_backend(args.backend)
     if args.episodes < 1:
         raise UserError('there is at least one episode', args.episodes, 'raise --episodes')
-    checkpoint = _load(args.checkpoint)
+    checkpoint = _load(args.checkpoint, args.robot)
     houses = args.house or checkpoint.info['houses']
     rooms = args.rooms or checkpoint.info['rooms']
     results = measure(checkpoint, houses, rooms, episodes=args.episodes, seed=args.seed,
                       controls=not args.no_controls, decoding=args.decoding,
-                      max_decisions=args.max_decisions)
+                      max_decisions=args.max_decisions, robot=args.robot)
     show_results(results, f'{args.checkpoint} in house {", ".join(map(str, houses))}, '
                           f'{args.max_decisions} decisions at most')
     if args.json:
@@ -207,7 +225,7 @@ def show_results(results: dict, title: str) -> None:
 def run_publish(args) -> int:
     """`vn_nav publish`."""
     from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
-    checkpoint = _load(args.source)
+    checkpoint = _load(args.source, args.robot)
     info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
     save_checkpoint(args.target, checkpoint.network, info, half=True)
     shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
@@ -215,7 +233,8 @@ def run_publish(args) -> int:
     info['results'] = {}
     for place, seeds in (('trained house', houses), (f'unseen house {args.unseen}',
                                                      [args.unseen])):
-        results = measure(shipped, seeds, rooms, episodes=args.episodes, seed=10_000)
+        results = measure(shipped, seeds, rooms, episodes=args.episodes, seed=10_000,
+                          robot=args.robot)
         show_results(results, place)
         info['results'] |= {f'{place}: {name}': figures for name, figures in results.items()}
     info['notes'] += (f' Measured with `vn_nav publish`, {args.episodes} episodes a row, 300 '
