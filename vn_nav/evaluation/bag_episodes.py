@@ -32,9 +32,7 @@ class RecordedEpisode:
     """One journey as the bag shows it."""
 
     facts: dict  # of the `episode` topic: index, goal, room, start, start_distance, limits
-    house: int
     episode: Episode
-    finished: bool
     trajectory: np.ndarray  # [K,3] x, y, yaw in the map
     goal_picture: np.ndarray | None  # [H,W,3] uint8
     pictures: list[np.ndarray]  # camera pictures, [H,W,3] uint8, in order
@@ -101,8 +99,7 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
         trajectory = np.array(poses[k]).reshape(-1, 3)
         episode = _measure(facts, trajectory, rewards[k], touched[k], ends[k])
         drives[place].episodes.append(RecordedEpisode(
-            facts, drives[place].scene['house'], episode, True, trajectory, goal_pictures[k],
-            views[k]))
+            facts, episode, trajectory, goal_pictures[k], views[k]))
     return drives
 
 
