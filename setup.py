@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 NAME = 'vn_nav'
 EXECUTABLES = {
     'vn_nav': 'vn_nav.cli:main',
+    'goal_node': 'vn_nav.nodes.goal_node:main',
     'policy_node': 'vn_nav.nodes.policy_node:main',
     'recorder_node': 'vn_nav.nodes.recorder_node:main',
     'sim_bridge_node': 'vn_sim_bridge.bridge_node:main',

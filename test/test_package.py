@@ -13,7 +13,7 @@ import pytest
 import vn_nav
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = {'vn_nav', 'policy_node', 'recorder_node', 'sim_bridge_node'}
+COMMANDS = {'vn_nav', 'goal_node', 'policy_node', 'recorder_node', 'sim_bridge_node'}
 
 
 @pytest.fixture

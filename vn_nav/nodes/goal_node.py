@@ -1,0 +1,76 @@
+"""`goal_node`: shows the robot a picture from a file, as a latched `goal_image`.
+
+Run: `ros2 run vn_nav goal_node --ros-args -p picture:=kitchen.jpg`; it stays until Ctrl-C, so that
+a policy that starts later still gets the picture. Start it again with another picture for the next
+goal.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Image
+
+from vn_msgs_py.images import ImageError, decode_rgb, fill_image
+from vn_nav.errors import UserError
+from vn_nav.nodes.qos import qos
+
+
+class GoalNode(Node):
+    """Publishes one picture."""
+
+    def __init__(self):
+        super().__init__('goal_node')
+        path = Path(self.declare_parameter('picture', '', ParameterDescriptor(
+            description="JPEG or PNG, taken by the robot's camera", read_only=True)).value)
+        if not path.is_file():
+            raise UserError('the goal is a picture file', str(path),
+                            'give one with --ros-args -p picture:=kitchen.jpg')
+        try:
+            picture = decode_rgb(SimpleNamespace(format=path.suffix, data=path.read_bytes()))
+        except ImageError as error:
+            raise UserError('the goal is a JPEG or PNG picture', f'{path}: {error}',
+                            'convert it') from error
+        self.publisher = self.create_publisher(Image, 'goal_image', qos('goal_image'))
+        message = fill_image(Image(), picture, 'rgb8')
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.publisher.publish(message)
+        self.get_logger().info(f'showing {path}, {picture.shape[1]} x {picture.shape[0]}')
+
+
+def main(args=None) -> int:
+    """Entry point: until a signal; exit code 2 and one line for a bad picture."""
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    node = None
+    try:
+        node = GoalNode()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not ended.is_set():
+            executor.spin_once(timeout_sec=0.2)
+    except UserError as error:
+        print(f'goal_node: {error}', file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
