@@ -29,6 +29,11 @@ def _latched(name, kind, publisher, meaning):
     return Topic(name, kind, publisher, meaning, RELIABLE, LATCHED, 1)
 
 
+def _history(name, kind, publisher, meaning):
+    # Discovery can take seconds: a recorder that is matched late gets what it missed.
+    return Topic(name, kind, publisher, meaning, RELIABLE, LATCHED, 2000)
+
+
 _IMAGE, _STRING = 'sensor_msgs/msg/Image', 'std_msgs/msg/String'
 
 TOPICS = (
@@ -41,20 +46,22 @@ TOPICS = (
     Topic('cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
           'velocity command; TwistStamped with enable_stamped_cmd_vel', depth=1),
     Topic('odom', 'nav_msgs/msg/Odometry', 'robot', 'wheel odometry; actions are closed on it'),
-    Topic('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
+    _history('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
     _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy', 'state and reasons'),
     _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),
     _sensor('labels/image_raw', _IMAGE, 'bridge', 'mono8 class ids'),
     _latched('labels/names', _STRING, 'bridge', 'JSON list: the names behind the class ids'),
-    Topic('collision', 'std_msgs/msg/Bool', 'bridge', "at a decision's end: it touched something"),
-    Topic('reward', 'std_msgs/msg/Float32', 'bridge', "at a decision's end: 1 on arrival, else 0"),
-    Topic('episode_end', 'std_msgs/msg/UInt8', 'bridge', '1 terminated, 2 truncated'),
-    Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
-          'true pose in the map, for evaluation; the policy never reads it', depth=200),
+    _history('collision', 'std_msgs/msg/Bool', 'bridge',
+             "at a decision's end: it touched something"),
+    _history('reward', 'std_msgs/msg/Float32', 'bridge',
+             "at a decision's end: 1 on arrival, else 0"),
+    _history('episode_end', 'std_msgs/msg/UInt8', 'bridge', '1 terminated, 2 truncated'),
+    _history('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
+             'true pose in the map, for evaluation; the policy never reads it'),
     _latched('scene', _STRING, 'bridge', 'JSON: house, rooms, goals, limits, world version'),
-    _latched('episode', _STRING, 'bridge', 'JSON: goal and start of the present episode'),
-    Topic('episode_result', _STRING, 'bridge', 'JSON: outcome of the episode that ended'),
+    _history('episode', _STRING, 'bridge', 'JSON: goal and start of every episode'),
+    _history('episode_result', _STRING, 'bridge', 'JSON: outcome of the episode that ended'),
     Topic('goal_pose', 'geometry_msgs/msg/PoseStamped', 'user',
           "a goal by pose; taken by the bridge's ~/reset", depth=1),
     _sensor('/clock', 'rosgraph_msgs/msg/Clock', 'bridge', 'simulated time'),

@@ -257,6 +257,8 @@ class PolicyNode(LifecycleNode):
         blockers = []
         if not self._running:
             blockers.append('the node is not active: activate it first')
+        if self.lock_step and self._odometry is None:
+            blockers.append('no odometry: lock_step answers each message on odom')
         if others := self._other_publishers():
             blockers.append(f'{others} other publisher(s) on cmd_vel: remap one')
         try:

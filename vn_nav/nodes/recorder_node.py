@@ -13,7 +13,7 @@ import threading
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -23,6 +23,7 @@ from vn_nav.errors import UserError
 from vn_nav.nodes.qos import qos
 
 QUEUE = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
+POLL = 0.002  # s between looks at the subscriptions
 
 
 class RecorderNode(Node):
@@ -46,20 +47,30 @@ class RecorderNode(Node):
                             'choose from vn_msgs_py.topics') from error
         self.writer = BagWriter(output, entries)
         self.count = 0
+        self.taps = []
         for entry in entries:
             package, _, kind = entry.type.split('/')
             message = getattr(importlib.import_module(f'{package}.msg'), kind)
-            self.create_subscription(message, entry.name, self._recorder(entry.name),
-                                     qos(entry.name, depth=QUEUE), raw=True)
+            subscription = self.create_subscription(
+                message, entry.name, lambda _: None,
+                qos(entry.name, depth=max(QUEUE, entry.depth)), raw=True)
+            self.taps.append((entry.name, message, subscription.handle))
         self.get_logger().info(f'recording {len(entries)} topics into {output}')
 
-    def _recorder(self, name: str):
-        def record(data: bytes, info: dict) -> None:
-            # The publisher's time: a busy recorder takes topics in turn, and the time of reception
-            # would then put them out of order.
-            self.writer.write(name, data, info['source_timestamp'])
-            self.count += 1
-        return record
+    def drain(self) -> None:
+        """Write everything that has arrived.
+
+        Taken straight from the subscriptions: an executor wakes up once a message, which a
+        simulator in lock-step outruns, and what then overflows is lost.
+        """
+        for name, message, handle in self.taps:
+            with handle:
+                while (taken := handle.take_message(message, True)) is not None:
+                    data, info = taken
+                    # The publisher's time: topics are taken in turn, so the time of reception
+                    # would put them out of order.
+                    self.writer.write(name, data, info['source_timestamp'])
+                    self.count += 1
 
 
 def main(args=None) -> int:
@@ -71,10 +82,9 @@ def main(args=None) -> int:
     node = None
     try:
         node = RecorderNode()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while not ended.is_set():
-            executor.spin_once(timeout_sec=0.1)
+        while not ended.wait(POLL):
+            node.drain()
+        node.drain()
     except UserError as error:
         print(f'recorder_node: {error}', file=sys.stderr)
         return 2
