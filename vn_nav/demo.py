@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.table import Table
 
 from vn_nav.errors import UserError
-from vn_nav.evaluation.bag_episodes import RecordedEpisode, drives_from_bag
+from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode, drives_from_bag
 from vn_nav.evaluation.evaluator import policy_actor, random_actor, run_episodes
 from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.evaluation.report import write_report
@@ -138,10 +138,11 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
         return 1
     finally:
         processes.stop_all()
-    result = _results(out, places, loaded, make_env)
+    drives = drives_from_bag(out / 'bag', pictures=True)
+    result = _results(drives, places, loaded, make_env)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
                'checkpoint': folder.name, 'date': datetime.date.today().isoformat()}
-    write_report(out / 'report.html', drives_from_bag(out / 'bag', pictures=True), result)
+    write_report(out / 'report.html', drives, result)
     result['seconds'] = round(time.monotonic() - begun, 1)
     (out / 'result.json').write_text(json.dumps(result, indent=2) + '\n')
     _show(console, result, out)
@@ -198,11 +199,11 @@ def _progress(done: list[tuple], count: int) -> Table:
     return table
 
 
-def _results(out: Path, places, checkpoint: LoadedCheckpoint, make_env: Callable) -> dict:
+def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint,
+             make_env: Callable) -> dict:
     """Figures from the bag; on the same starts random actions, and the policy without ROS."""
     result = {}
-    for (place, house, count, limit), drive in zip(places, drives_from_bag(out / 'bag'),
-                                                   strict=True):
+    for (place, house, count, limit), drive in zip(places, drives, strict=True):
         figures = summarise([recorded.episode for recorded in drive.episodes])
         env = make_env([house], checkpoint.info['rooms'], count, max_decisions=limit)
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import sys
+import threading
 import time
 
 import numpy as np
-import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Bool, Float32, String, UInt8
@@ -27,6 +25,7 @@ from std_srvs.srv import Trigger
 
 from vn_msgs_py import images, motion
 from vn_nav.errors import UserError
+from vn_nav.nodes.process import run_node
 from vn_nav.nodes.qos import qos
 from vn_nav.robot import RobotSpec, load_robot
 from vn_sim_bridge import tasks
@@ -286,19 +285,7 @@ class SimBridgeNode(Node):
         self._odometry.publish(motion.fill_odometry(self._odometry_message, x, y, yaw, velocity))
 
 
-class Signals:
-    """SIGINT and SIGTERM end the loop; rclpy's own handlers would close the context first."""
-
-    def __init__(self):
-        self.received = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._note)
-
-    def _note(self, *_):
-        self.received = True
-
-
-def run(node: SimBridgeNode, signals: Signals) -> None:
+def run(node: SimBridgeNode, ended: threading.Event) -> None:
     """Tick until a signal comes or the last episode has ended.
 
     At rest a tick lasts 50 ms of wall time. In lock-step motion the next tick waits for a command.
@@ -306,10 +293,10 @@ def run(node: SimBridgeNode, signals: Signals) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     next_tick = time.monotonic()
-    while not signals.received:
+    while not ended.is_set():
         if node.done and node.exit_when_done:
             linger = time.monotonic() + 0.5  # the last messages are still on their way
-            while time.monotonic() < linger and not signals.received:
+            while time.monotonic() < linger and not ended.is_set():
                 executor.spin_once(timeout_sec=0.05)
             return
         answered = node.command_count
@@ -319,7 +306,7 @@ def run(node: SimBridgeNode, signals: Signals) -> None:
             next_tick = now + (LOCK_STEP_TIMEOUT if moving else TICK)
         else:
             next_tick = max(next_tick + TICK, now)  # late ticks are caught up, not skipped
-        while not signals.received:
+        while not ended.is_set():
             remaining = next_tick - time.monotonic()
             if remaining <= 0:
                 if node.lock_step and moving:
@@ -335,22 +322,7 @@ def run(node: SimBridgeNode, signals: Signals) -> None:
 
 def main(args=None) -> int:
     """Entry point. Exit code 2 and one line on standard error for bad parameters."""
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    signals = Signals()
-    node = None
-    try:
-        node = SimBridgeNode()
-        run(node, signals)
-    except UserError as error:
-        print(f'sim_bridge_node: {error}', file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    return run_node('sim_bridge_node', SimBridgeNode, run, args)
 
 
 if __name__ == '__main__':

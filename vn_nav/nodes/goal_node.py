@@ -7,21 +7,17 @@ goal.
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 
-import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
 from vn_msgs_py.images import ImageError, decode_rgb, fill_image
 from vn_nav.errors import UserError
+from vn_nav.nodes.process import run_node, spin
 from vn_nav.nodes.qos import qos
 
 
@@ -49,27 +45,7 @@ class GoalNode(Node):
 
 def main(args=None) -> int:
     """Entry point: until a signal; exit code 2 and one line for a bad picture."""
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    node = None
-    try:
-        node = GoalNode()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while not ended.is_set():
-            executor.spin_once(timeout_sec=0.2)
-    except UserError as error:
-        print(f'goal_node: {error}', file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    return run_node('goal_node', GoalNode, spin, args)
 
 
 if __name__ == '__main__':

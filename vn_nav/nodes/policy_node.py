@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import sys
 import threading
 import time
 
 import numpy as np
-import rclpy
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
@@ -24,7 +22,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Int8, String
 from std_srvs.srv import SetBool, Trigger
@@ -33,6 +30,7 @@ from vn_msgs_py import images, motion
 from vn_nav.errors import UserError
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.diagnosis import Diagnosis
+from vn_nav.nodes.process import run_node
 from vn_nav.nodes.qos import qos
 from vn_nav.observation import crop_fraction, preprocess
 from vn_nav.policy.navigator import Limits, Navigator, State
@@ -66,9 +64,10 @@ class PolicyNode(LifecycleNode):
         self._odometry: np.ndarray | None = None
         self._odometry_stamp = 0.0
         self._odometry_rests = True
+        self._robot_moves = False  # by the last command sent
         self._odometry_received = -math.inf
         self._odometry_count = 0
-        self.failure = ''
+        self.failure: UserError | None = None
 
     def _on_parameters(self, parameters) -> SetParametersResult:
         """Operation is fixed while active: a limit must not move under a moving robot."""
@@ -89,15 +88,15 @@ class PolicyNode(LifecycleNode):
         try:
             self._configure()
         except UserError as error:
-            self._fail(str(error))
+            self._fail(error)
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
-    def _fail(self, reason: str) -> None:
+    def _fail(self, error: UserError) -> None:
         """Say why a transition failed: once. With autostart `main` says it and exits."""
-        self.failure = reason
+        self.failure = error
         if not self.get_parameter('autostart').value:
-            self.get_logger().error(reason)
+            self.get_logger().error(str(error))
 
     def _configure(self) -> None:
         value = policy_parameters.read(self)
@@ -147,8 +146,9 @@ class PolicyNode(LifecycleNode):
         """Start looking; motion needs ~/enable."""
         others = self._other_publishers()
         if others:
-            self._fail(f'this node alone publishes its command topic; received {others} more '
-                       'publisher(s) on cmd_vel; remap one of them (twist_mux combines them)')
+            self._fail(UserError(
+                'this node alone publishes its command topic', f'{others} more publisher(s) on '
+                'cmd_vel', 'remap one of them (twist_mux combines them)'))
             return TransitionCallbackReturn.FAILURE
         self._running = True
         self._threads = [threading.Thread(target=self._guard, args=(loop,), name=loop.__name__,
@@ -176,6 +176,16 @@ class PolicyNode(LifecycleNode):
         """As deactivation, from any state."""
         self.halt('shut down')
         return TransitionCallbackReturn.SUCCESS
+
+    @property
+    def is_running(self) -> bool:
+        """Active: both threads are at work."""
+        return self._running
+
+    def destroy_node(self) -> None:
+        """Zero first, then everything else."""
+        self.halt('the process ends')
+        super().destroy_node()
 
     def halt(self, reason: str) -> None:
         """End both threads with a zero command that has been delivered (200 ms at most)."""
@@ -388,7 +398,7 @@ class PolicyNode(LifecycleNode):
                 # A stop does not wait for the next period.
                 self._wake.wait_for(
                     lambda: not self._running or (self.navigator.state is State.STOPPED
-                                                  and self.navigator.velocity_sent),
+                                                  and self._robot_moves),
                     timeout=max(0.0, due - time.monotonic()))
                 if not self._running:
                     return
@@ -398,7 +408,7 @@ class PolicyNode(LifecycleNode):
                 stamp = self.get_clock().now().nanoseconds * 1e-9
                 velocity = self.navigator.step(now, self.period, self._odometry, stamp,
                                                odometry_lost=lost)
-                self.navigator.velocity_sent = velocity is not None and bool(velocity.any())
+                self._robot_moves = velocity is not None and bool(velocity.any())
             if velocity is not None:
                 self._send(velocity)
 
@@ -442,36 +452,28 @@ class PolicyNode(LifecycleNode):
         self._command.publish(motion.fill_twist(message, velocity))
 
 
-def main(args=None) -> int:
-    """Entry point: 0 after a signal, 2 and one line on standard error for bad input."""
-    # rclpy's own handlers would close the context before the zero command is out.
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    node = PolicyNode()
+def drive(node: PolicyNode, ended: threading.Event) -> None:
+    """Bring the node up and serve it; a callback that fails takes it out of action."""
+    if node.get_parameter('autostart').value:
+        for transition in (node.trigger_configure, node.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                raise node.failure
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    try:
-        if node.get_parameter('autostart').value:
-            for transition in (node.trigger_configure, node.trigger_activate):
-                if transition() != TransitionCallbackReturn.SUCCESS:
-                    print(f'policy_node: {node.failure}', file=sys.stderr)
-                    return 2
-        while not ended.is_set():
-            try:
-                executor.spin_once(timeout_sec=0.1)
-            except (KeyboardInterrupt, ExternalShutdownException):
-                break
-            except Exception as error:  # a callback failed: stand still, go inactive, say so
-                node.get_logger().error(f'callback failed, going inactive: {error!r}')
-                if node._running:
-                    node.trigger_deactivate()
-    finally:
-        node.halt('the process ends')
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    while not ended.is_set():
+        try:
+            executor.spin_once(timeout_sec=0.1)
+        except ExternalShutdownException:
+            raise
+        except Exception as error:  # stand still, go inactive, say so
+            node.get_logger().error(f'callback failed, going inactive: {error!r}')
+            if node.is_running:
+                node.trigger_deactivate()
+
+
+def main(args=None) -> int:
+    """Entry point: 0 after a signal, 2 and one line on standard error for bad input."""
+    return run_node('policy_node', PolicyNode, drive, args)
 
 
 if __name__ == '__main__':

@@ -7,19 +7,16 @@ from __future__ import annotations
 
 import datetime
 import importlib
-import signal
 import sys
 import threading
 
-import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from vn_msgs_py.topics import TOPICS, topic
 from vn_nav.bags.recorder import BagWriter
 from vn_nav.errors import UserError
+from vn_nav.nodes.process import run_node
 from vn_nav.nodes.qos import qos
 
 QUEUE = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
@@ -72,32 +69,23 @@ class RecorderNode(Node):
                     self.writer.write(name, data, info['source_timestamp'])
                     self.count += 1
 
+    def destroy_node(self) -> None:
+        """Finish the bag."""
+        self.writer.close()
+        self.get_logger().info(f'{self.count} messages recorded')
+        super().destroy_node()
+
+
+def record(node: RecorderNode, ended: threading.Event) -> None:
+    """Write until the event is set."""
+    while not ended.wait(POLL):
+        node.drain()
+    node.drain()
+
 
 def main(args=None) -> int:
     """Entry point: SIGINT and SIGTERM finish the bag."""
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    node = None
-    try:
-        node = RecorderNode()
-        while not ended.wait(POLL):
-            node.drain()
-        node.drain()
-    except UserError as error:
-        print(f'recorder_node: {error}', file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        if node is not None:
-            if hasattr(node, 'writer'):
-                node.writer.close()
-                node.get_logger().info(f'{node.count} messages recorded')
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    return run_node('recorder_node', RecorderNode, record, args)
 
 
 if __name__ == '__main__':

@@ -72,7 +72,6 @@ class Navigator:
         self.goal_identity: object = None
         self.goal_ready = False
         self.velocity = np.zeros(4)
-        self.velocity_sent = False  # the last command moved the robot
         self.decisions = 0  # in this episode
         self.dropped: dict[str, int] = {}  # frames by reason
         self._target = np.zeros(4)
