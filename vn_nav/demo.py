@@ -46,6 +46,7 @@ class Processes:
 
     def __init__(self, logs: Path):
         self.logs, self.running = logs, {}
+        self.killed: list[str] = []  # children that did not end when they were asked to
         logs.mkdir(parents=True, exist_ok=True)
         self.environment = os.environ | {
             'FASTRTPS_DEFAULT_PROFILES_FILE': str(share_file('config/fastdds_localhost.xml')),
@@ -83,6 +84,8 @@ class Processes:
             return
         for number, patience in ((signal.SIGINT, 10), (signal.SIGKILL, 10)):
             if process.poll() is None:
+                if number == signal.SIGKILL:
+                    self.killed.append(name)
                 os.killpg(process.pid, number)
                 try:
                     process.wait(patience)
@@ -138,6 +141,10 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
         return 1
     finally:
         processes.stop_all()
+    if processes.killed:
+        console.print(f'[red]vn_nav demo: {", ".join(processes.killed)} did not end within 10 s '
+                      f'of SIGINT and had to be killed[/]; logs are in {out / "logs"}')
+        return 1
     drives = drives_from_bag(out / 'bag', pictures=True)
     result = _results(drives, places, loaded, make_env)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-import threading
 import time
 
 import numpy as np
@@ -25,7 +24,7 @@ from std_srvs.srv import Trigger
 
 from vn_msgs_py import images, motion
 from vn_nav.errors import UserError
-from vn_nav.nodes.process import run_node
+from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos
 from vn_nav.robot import RobotSpec, load_robot
 from vn_sim_bridge import tasks
@@ -285,7 +284,7 @@ class SimBridgeNode(Node):
         self._odometry.publish(motion.fill_odometry(self._odometry_message, x, y, yaw, velocity))
 
 
-def run(node: SimBridgeNode, ended: threading.Event) -> None:
+def run(node: SimBridgeNode, ended: Ended) -> None:
     """Tick until a signal comes or the last episode has ended.
 
     At rest a tick lasts 50 ms of wall time. In lock-step motion the next tick waits for a command.

@@ -30,7 +30,7 @@ from vn_msgs_py import images, motion
 from vn_nav.errors import UserError
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.diagnosis import Diagnosis
-from vn_nav.nodes.process import run_node
+from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos
 from vn_nav.observation import crop_fraction, preprocess
 from vn_nav.policy.navigator import Limits, Navigator, State
@@ -452,7 +452,7 @@ class PolicyNode(LifecycleNode):
         self._command.publish(motion.fill_twist(message, velocity))
 
 
-def drive(node: PolicyNode, ended: threading.Event) -> None:
+def drive(node: PolicyNode, ended: Ended) -> None:
     """Bring the node up and serve it; a callback that fails takes it out of action."""
     if node.get_parameter('autostart').value:
         for transition in (node.trigger_configure, node.trigger_activate):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sys
-import threading
 from collections.abc import Callable
 
 import rclpy
@@ -15,14 +14,34 @@ from rclpy.signals import SignalHandlerOptions
 from vn_nav.errors import UserError
 
 
-def run_node(name: str, make: Callable[[], Node], work: Callable[[Node, threading.Event], None],
+class Ended:
+    """Becomes true at SIGINT or SIGTERM.
+
+    Not a `threading.Event`: a signal handler runs in the middle of what the main thread does, and
+    `Event.set` there waits for ever for the lock that an interrupted `Event.wait` holds.
+    """
+
+    def __init__(self):
+        self._ended = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, *_):
+        self._ended = True
+
+    def is_set(self) -> bool:
+        """A signal has come."""
+        return self._ended
+
+
+def run_node(name: str, make: Callable[[], Node], work: Callable[[Node, Ended], None],
              args: list[str] | None = None) -> int:
     """Make a node, work until a signal, destroy it.
 
     Args:
         name: of the program, in front of its error line.
         make: builds the node; its `destroy_node` lets go of everything.
-        work: returns when its event is set (SIGINT, SIGTERM) or when it is done.
+        work: returns when it is done, or soon after a signal.
         args: command line; None: the process's own.
 
     Returns:
@@ -30,9 +49,7 @@ def run_node(name: str, make: Callable[[], Node], work: Callable[[Node, threadin
     """
     # rclpy's own handlers would close the context before the last message is out.
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+    ended = Ended()
     node = None
     try:
         node = make()
@@ -49,8 +66,8 @@ def run_node(name: str, make: Callable[[], Node], work: Callable[[Node, threadin
     return 0
 
 
-def spin(node: Node, ended: threading.Event) -> None:
-    """Serve callbacks until the event is set."""
+def spin(node: Node, ended: Ended) -> None:
+    """Serve callbacks until a signal comes."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not ended.is_set():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import datetime
 import importlib
 import sys
-import threading
+import time
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
@@ -16,7 +16,7 @@ from rclpy.node import Node
 from vn_msgs_py.topics import TOPICS, topic
 from vn_nav.bags.recorder import BagWriter
 from vn_nav.errors import UserError
-from vn_nav.nodes.process import run_node
+from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos
 
 QUEUE = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
@@ -76,10 +76,11 @@ class RecorderNode(Node):
         super().destroy_node()
 
 
-def record(node: RecorderNode, ended: threading.Event) -> None:
-    """Write until the event is set."""
-    while not ended.wait(POLL):
+def record(node: RecorderNode, ended: Ended) -> None:
+    """Write until a signal comes."""
+    while not ended.is_set():
         node.drain()
+        time.sleep(POLL)
     node.drain()
 
 
