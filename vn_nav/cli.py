@@ -94,6 +94,8 @@ def _add_world(parser: argparse.ArgumentParser, defaults: bool = True) -> None:
     parser.add_argument('--rooms', type=int, default=5 if defaults else None)
     parser.add_argument('--robot', type=Path, metavar='YAML',
                         help='robot file (config/robots/); default: the standard robot')
+    parser.add_argument('--randomisation', default='none' if defaults else None, metavar='NAME',
+                        help='of light, camera and base: none, standard, rough or a YAML file')
     parser.add_argument('--seed', type=int, default=0 if defaults else 10_000)
 
 
@@ -103,12 +105,14 @@ def _check_backend(name: str) -> None:
 
 
 def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, threads: int = 1,
-             **options):
+             randomisation: str | Path = 'none', **options):
     """A `NavigationEnv` of embedded houses; without a robot file with the standard robot."""
     from vn_nav.robot import load_robot
     from vn_sim_bridge.env import EnvConfig, NavigationEnv
-    return NavigationEnv(EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs, **options),
-                         load_robot(robot) if robot else None, threads=threads)
+    from vn_sim_bridge.randomisation import load_randomisation
+    config = EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs,
+                       randomisation=load_randomisation(randomisation), **options)
+    return NavigationEnv(config, load_robot(robot) if robot else None, threads=threads)
 
 
 def run_train(args) -> int:
@@ -117,7 +121,8 @@ def run_train(args) -> int:
     from vn_nav.learning.trainer import TrainConfig, train
     houses = args.house or [0]
     env = make_env(houses, args.rooms, args.envs, robot=args.robot, threads=args.threads,
-                   size=args.size, seed=args.seed, actions=tuple(args.actions.split(',')),
+                   randomisation=args.randomisation, size=args.size, seed=args.seed,
+                   actions=tuple(args.actions.split(',')),
                    progress_reward=args.progress_reward, collision_reward=args.collision_reward)
     config = TrainConfig(
         frames=int(args.frames), minutes=args.minutes, rollout_length=args.rollout_length,
@@ -128,7 +133,8 @@ def run_train(args) -> int:
         tensorboard=not args.no_tensorboard)
     words = [word for word in sys.argv[1:] if word != '--resume']
     info = {
-        'houses': houses, 'rooms': args.rooms, 'command': 'vn_nav ' + shlex.join(words),
+        'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
+        'command': 'vn_nav ' + shlex.join(words),
         'camera_fov_deg': math.degrees(env.robot.camera_fov),
         'camera_height': env.robot.camera_height,
         'notes': f'Trained on {machine()}, {args.threads} thread(s), '
@@ -173,10 +179,11 @@ def _load(path: Path, robot: Path | None = None):
 
 def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, controls: bool = True,
             decoding: str | None = None, max_decisions: int = 300,
-            robot: Path | None = None) -> dict:
+            robot: Path | None = None, randomisation: str | None = None) -> dict:
     """Figures of a loaded checkpoint in some houses."""
     from vn_nav.evaluation.evaluator import evaluate
     env = make_env(houses, rooms, min(50, episodes), robot=robot, size=checkpoint.config.size,
+                   randomisation=randomisation or checkpoint.info['randomisation'],
                    actions=checkpoint.config.actions, max_decisions=max_decisions)
     return evaluate(env, checkpoint.network, decoding=decoding or checkpoint.info['decoding'],
                     episodes=episodes, controls=controls, seed=seed)
@@ -192,7 +199,8 @@ def run_evaluate(args) -> int:
     rooms = args.rooms or checkpoint.info['rooms']
     results = measure(checkpoint, houses, rooms, episodes=args.episodes, seed=args.seed,
                       controls=not args.no_controls, decoding=args.decoding,
-                      max_decisions=args.max_decisions, robot=args.robot)
+                      max_decisions=args.max_decisions, robot=args.robot,
+                      randomisation=args.randomisation)
     show_results(results, f'{args.checkpoint} in house {", ".join(map(str, houses))}, '
                           f'{args.max_decisions} decisions at most')
     if args.json:

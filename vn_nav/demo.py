@@ -134,7 +134,7 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
         processes.start('recorder', 'vn_nav.nodes.recorder_node',
                         {'output': str(out / 'bag'), 'topics': RECORDED})
         for index, (place, house, count, limit) in enumerate(places):
-            _drive(console, processes, folder, place, house, info['rooms'], count, limit,
+            _drive(console, processes, folder, info, place, house, count, limit,
                    start_time=1.0 + 1e5 * index)
     except ProcessFailure as error:
         console.print(f'[red]vn_nav demo: {error}[/]; logs are in {out / "logs"}')
@@ -156,15 +156,16 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
     return 0
 
 
-def _drive(console: Console, processes: Processes, checkpoint: Path, place: str, house: int,
-           rooms: int, count: int, limit: int, start_time: float) -> None:
+def _drive(console: Console, processes: Processes, checkpoint: Path, info: dict, place: str,
+           house: int, count: int, limit: int, start_time: float) -> None:
     """All episodes in one house."""
     base = str(share_file('config/robots/demo_base.yaml'))
     bridge, policy = f'bridge_{place}', f'policy_{place}'
     note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
     console.print(f'\n[bold]{place} house[/], seed {house}{note}')
     processes.start(bridge, 'vn_sim_bridge.bridge_node', {
-        'house': house, 'rooms': rooms, 'robot': base, 'time': 'lock_step', 'seed': SEED,
+        'house': house, 'rooms': info['rooms'], 'randomisation': info['randomisation'],
+        'robot': base, 'time': 'lock_step', 'seed': SEED,
         'episodes': count, 'max_decisions': limit, 'exit_when_done': True,
         'start_time': start_time})
     processes.start(policy, 'vn_nav.nodes.policy_node', {
@@ -212,7 +213,8 @@ def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint,
     result = {}
     for (place, house, count, limit), drive in zip(places, drives, strict=True):
         figures = summarise([recorded.episode for recorded in drive.episodes])
-        env = make_env([house], checkpoint.info['rooms'], count, max_decisions=limit)
+        env = make_env([house], checkpoint.info['rooms'], count, max_decisions=limit,
+                       randomisation=checkpoint.info['randomisation'])
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
         actor = policy_actor(env, checkpoint.network, checkpoint.info['decoding'], SEED)
         in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())

@@ -28,7 +28,8 @@ from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos
 from vn_nav.robot import RobotSpec, load_robot
 from vn_sim_bridge import tasks
-from vn_sim_bridge.houses.furniture import LABELS
+from vn_sim_bridge.houses.labels import LABELS
+from vn_sim_bridge.randomisation import load_randomisation
 from vn_sim_bridge.simulated_robot import TICK, TRUNCATED, SimulatedRobot
 from vn_sim_bridge.world import WORLD_VERSION
 
@@ -40,10 +41,11 @@ OPTICAL_FRAME = 'camera_optical_frame'
 PARAMETERS = {
     'backend': ('house', 'simulator behind the bridge: house'),
     'house': (0, 'seed of the house'),
-    'rooms': (5, 'number of rooms, 1 to 8'),
+    'rooms': (5, 'number of rooms, 1 to 12'),
     'robot': ('', 'YAML file of the robot; empty: the standard robot'),
     'size': (84, 'side of the square camera picture [pixels]'),
     'noise': (True, 'Gaussian motion noise'),
+    'randomisation': ('none', 'of light, camera and base: none, standard, rough or a YAML file'),
     'seed': (0, 'of starts, goals and noise'),
     'time': ('real_time', 'real_time or lock_step (docs/architecture.md, "Time")'),
     'mode': ('stop_and_go', 'lock_step: stop_and_go shows pictures at rest, continuous always'),
@@ -73,7 +75,8 @@ class SimBridgeNode(Node):
         robot = load_robot(values['robot']) if values['robot'] else RobotSpec()
         self.robot = SimulatedRobot(
             values['house'], values['rooms'], robot=robot, size=values['size'],
-            noise=values['noise'], seed=values['seed'], max_decisions=values['max_decisions'])
+            noise=values['noise'], seed=values['seed'], max_decisions=values['max_decisions'],
+            randomisation=load_randomisation(values['randomisation']))
         self.size, self.start_time = values['size'], values['start_time']
         self.command = np.zeros(4)
         self.command_tick = 0  # when the newest command came, in ticks
@@ -144,7 +147,9 @@ class SimBridgeNode(Node):
             'area': house.area,
             'rooms_list': [{'name': room.name, 'rect': list(room.rect)} for room in house.rooms],
             'walls': [list(o.rect) for o in house.obstacles if o.label == 'wall'],
-            'obstacles': [[*o.rect, o.label] for o in house.obstacles if o.label != 'wall'],
+            'obstacles': [[*o.rect, o.label] for o in house.obstacles
+                          if o.label not in ('wall', 'outside')],
+            'outside': [list(o.rect) for o in house.obstacles if o.label == 'outside'],
             'goals': [{'room': goal.room, 'pose': list(goal.pose)} for goal in house.goals],
             'arrival': {'radius': tasks.ARRIVAL_RADIUS,
                         'heading_deg': math.degrees(tasks.ARRIVAL_HEADING)},
@@ -260,7 +265,7 @@ class SimBridgeNode(Node):
         return True
 
     def _publish_pictures(self, stamp: Time) -> None:
-        frames = self.robot.backend.observe()
+        frames = self.robot.observe()
         self._info_message.header.stamp = stamp
         self._camera_info.publish(self._info_message)
         streams = [(self._image, frames.rgb[0].transpose(1, 2, 0), 'rgb8')]

@@ -20,6 +20,15 @@ class Stream(enum.IntEnum):
     START_YAW = 3
     MOTION_NOISE = 4
     WRONG_GOAL = 5
+    APPEARANCE = 6  # light and camera of an episode
+    GOAL_APPEARANCE = 7  # of a goal picture
+    GOAL_VARIANT = 8
+    SENSOR = 9
+    BASE = 10  # motion scale of an episode
+    SLIP = 11
+    LATE_PICTURE = 12
+    OBJECT_PLACE = 13
+    OBJECT_KIND = 14
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
@@ -36,6 +45,11 @@ def _hash(*keys) -> np.ndarray:
             state = (state ^ (state >> np.uint64(27))) * _MIX_2
             state = state ^ (state >> np.uint64(31))
     return state
+
+
+def key(seed: int, stream: Stream, env, episode, step=0) -> np.ndarray:
+    """64 random bits, uint64; integer arguments broadcast."""
+    return _hash(seed, stream, env, episode, step)
 
 
 def uniform(seed: int, stream: Stream, env, episode, step=0) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`NavigationEnv`: many robots that look for the places of pictures, as a Gymnasium VectorEnv."""
+"""`NavigationEnv`: many robots in embedded houses with a task, as a Gymnasium VectorEnv."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ from gymnasium.vector.utils import batch_space
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge import tasks
+from vn_sim_bridge.backends.base import Frames
 from vn_sim_bridge.backends.house import HouseBackend
-from vn_sim_bridge.counter_random import Stream, normal
+from vn_sim_bridge.counter_random import Stream, key, normal, uniform
+from vn_sim_bridge.houses.house import CELL, interpolate
+from vn_sim_bridge.houses.objects import GOAL_OBJECTS
 from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.randomisation import Randomisation
+from vn_sim_bridge.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.world import motion_noise
 
+TASKS = ('image', 'object', 'room', 'collect')
 PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action')
 TURN_COST = 0.05  # m, what the shortest-path action charges for one rotation
 BLOCKED_COST = 1.0  # per metre that a contact cuts off a forward move
-RIGHT, WRONG, BLANK = 'right', 'wrong', 'blank'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +46,11 @@ class EnvConfig:
     min_start_distance: float = 1.0  # m, geodesic
     one_goal_per_env: bool = False  # environment i keeps pair i; else drawn each episode
     seed: int = 0
+    goals_per_room: int = 1
+    task: str = 'image'  # of TASKS
+    objects: int = 1  # in the house at a time (object, collect)
+    room_must_see: bool = False  # the room rule of House3D's code, see tasks.RoomGoal
+    randomisation: Randomisation = Randomisation()
     privileged: tuple[str, ...] = ()  # of PRIVILEGED
 
     def __post_init__(self):
@@ -49,6 +59,8 @@ class EnvConfig:
             (self.num_envs >= 1, 'there is at least one environment', self.num_envs),
             (self.max_decisions >= 1, 'an episode has at least one decision', self.max_decisions),
             (8 <= self.size <= 2048, 'pictures have 8 to 2048 pixels a side', self.size),
+            (self.task in TASKS, f'the task is one of {", ".join(TASKS)}', self.task),
+            (1 <= self.objects <= 16, 'there are 1 to 16 objects', self.objects),
             (set(self.privileged) <= set(PRIVILEGED),
              f'privileged outputs are some of {", ".join(PRIVILEGED)}', self.privileged),
         )
@@ -58,7 +70,7 @@ class EnvConfig:
 
 
 class NavigationEnv(gymnasium.vector.VectorEnv):
-    """Image-goal navigation in embedded houses.
+    """Visual navigation in embedded houses.
 
     Observations are a dict of arrays over the N environments: `image` [N,3,H,W] uint8,
     `goal_index` [N] int64 into `goals`, `last_action` [N] int64 (-1 at an episode's start) and
@@ -81,22 +93,28 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.config = config = config or EnvConfig()
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs = n = config.num_envs
-        self.houses = [generate_house(seed, rooms=config.rooms) for seed in config.houses]
+        self.houses = [generate_house(seed, rooms=config.rooms,
+                                      goals_per_room=config.goals_per_room)
+                       for seed in config.houses]
         self.house_index = np.arange(n) % len(self.houses)
-        self.backend = HouseBackend(self.houses, self.house_index, robot=self.robot,
-                                    size=config.size, threads=threads)
+        self._seed = config.seed
+        self.task = self._make_task()
+        self.backend = HouseBackend(
+            self.houses, self.house_index, robot=self.robot, size=config.size, threads=threads,
+            randomisation=config.randomisation, models=self.task.models,
+            objects=self.task.objects)
         self.world_version = self.backend.world_version
         self.action_names = self.robot.action_names
         self._deltas = np.array([[a.dx, a.dy, a.dyaw, a.dpitch] for a in self.robot.actions])
         self._sizes = np.array([abs(action.size) for action in self.robot.actions])
         self._make_goals()
         self._make_spaces()
-        self._seed = config.seed
         self._tau = 1.0
-        self._shown = RIGHT
+        self._mode = RIGHT
         self._episode = np.full(n, -1, np.int64)
         self._step = np.zeros(n, np.int64)
-        self._goal = np.zeros(n, np.int64)  # index of the true goal in the pool
+        self._goal = np.zeros(n, np.int64)  # index of the view that names the true goal
+        self._goal_yaw = np.zeros(n)
         self._shown_goal = np.zeros(n, np.int64)
         self._distance = np.zeros(n)
         self._start_distance = np.zeros(n)
@@ -104,26 +122,49 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._last_action = np.full(n, -1, np.int64)
         self._last_reward = np.zeros(n, np.float32)
         self._done = np.ones(n, bool)
+        self._motion_scale = np.ones(n)
+        self._last_image = np.zeros((n, 3, config.size, config.size), np.uint8)
+        # Every environment's distances to its goal, side by side: one look-up for all.
+        shapes = [house.floor.free.shape for house in self.houses]
+        self._maps = np.full((n, max(s[0] for s in shapes), max(s[1] for s in shapes)), np.inf,
+                             np.float32)
+        self._origins = np.array([self.houses[h].floor.origin for h in self.house_index])
+
+    def _make_task(self) -> tasks.Task:
+        config, common = self.config, (self.houses, self.config.num_envs)
+        distance = config.min_start_distance
+        if config.task == 'image':
+            return tasks.ImageGoal(*common, min_distance=distance,
+                                   fixed_goals=config.one_goal_per_env)
+        if config.task == 'object':
+            return tasks.ObjectGoal(
+                *common, models=GOAL_OBJECTS, objects=config.objects,
+                pictures=max(4, config.randomisation.pictures_per_goal), min_distance=distance,
+                seed=config.seed)
+        if config.task == 'room':
+            return tasks.RoomGoal(*common, must_see=config.room_must_see, min_distance=distance)
+        return tasks.Collect(*common, objects=config.objects)
 
     def _make_goals(self) -> None:
-        """The pool of goals over all houses, and their pictures."""
-        pool, owner = [], []
-        self._goal_range = []
-        for index, house in enumerate(self.houses):
-            self._goal_range.append((len(pool), len(house.goals)))
-            pool += [tasks.GoalField(house, goal, self.config.min_start_distance)
-                     for goal in house.goals]
-            owner += [index] * len(house.goals)
-        self.goal_fields = pool
-        self.goal_poses = np.array([entry.goal.pose for entry in pool])
-        self.goal_rooms = tuple(entry.goal.room for entry in pool)
-        frames = self.backend.view(np.array(owner), self.goal_poses)
-        size = self.config.size
-        grey = np.full((1, 3, size, size), 128, np.uint8)
-        self.goals = np.concatenate([frames.rgb, grey])
-        self.goal_segmentation = np.concatenate([frames.labels, np.zeros((1, size, size),
-                                                                         np.uint8)])
-        self.blank_goal = len(pool)
+        """The pictures of all views, each in some lights of its own."""
+        views = self.task.views
+        self.goal_poses = np.array([view.pose for view in views]).reshape(-1, 4)
+        self.goal_rooms = (*(view.name for view in views), 'nothing')
+        self._variants = variants = self.config.randomisation.pictures_per_goal
+        size, count = self.config.size, len(views)
+        view = np.repeat(np.arange(count), variants)
+        variant = np.tile(np.arange(variants), count)
+        rgb = np.full((count * variants + 1, 3, size, size), 128, np.uint8)
+        self.goal_segmentation = np.zeros((count * variants + 1, size, size), np.uint8)
+        if count:
+            frames = self.backend.view(
+                np.array([views[k].house for k in view]), self.goal_poses[view], None,
+                self.backend.appearance(self._seed, Stream.GOAL_APPEARANCE, view, variant),
+                key(self._seed, Stream.GOAL_APPEARANCE, view, variant, 99),
+                [views[k].objects for k in view])
+            rgb[:-1], self.goal_segmentation[:-1] = frames.rgb, frames.labels
+        self.goals = rgb
+        self.blank_goal = count * variants
 
     def _make_spaces(self) -> None:
         size, actions = self.config.size, len(self.action_names)
@@ -131,13 +172,13 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'image': spaces.Box(0, 255, (3, size, size), np.uint8),
             'goal_index': spaces.Discrete(len(self.goals)),
             'last_action': spaces.Discrete(actions + 1, start=-1),
-            'last_reward': spaces.Box(-1.0, 1.0, (), np.float32),
+            'last_reward': spaces.Box(-np.inf, np.inf, (), np.float32),
         })
         self.single_action_space = spaces.Discrete(actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-    # The three switches that training and evaluation turn.
+    # The two switches that training and evaluation turn.
 
     def set_difficulty(self, tau: float) -> None:
         """Start later episodes within tau * the maximum distance of their goal, tau in (0, 1]."""
@@ -149,25 +190,35 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """Which picture later episodes show: 'right', 'wrong' (same house) or 'blank'."""
         if mode not in (RIGHT, WRONG, BLANK):
             raise UserError('the shown goal is right, wrong or blank', mode, 'choose one of them')
-        if mode == WRONG and min(count for _, count in self._goal_range) < 2:
+        if mode == WRONG and min(count for _, count in self.task.ranges) < 2:
             raise UserError('a wrong goal needs a house with at least two goals',
                             self.config.rooms, 'use more rooms')
-        self._shown = mode
+        self._mode = mode
 
-    _STATE = ('_episode', '_step', '_goal', '_shown_goal', '_distance', '_start_distance',
-              '_path_length', '_last_action', '_last_reward', '_done')
+    _STATE = ('_episode', '_step', '_goal', '_goal_yaw', '_shown_goal', '_distance',
+              '_start_distance', '_path_length', '_last_action', '_last_reward', '_done',
+              '_motion_scale', '_last_image', '_maps')
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that changes from step to step; with equal switches `set_state` goes on."""
+        objects = self.backend.objects
         return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed),
-                **{name.strip('_'): getattr(self, name).copy() for name in self._STATE}}
+                **{name.strip('_'): getattr(self, name).copy() for name in self._STATE},
+                **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
+                **{f'task_{name}': part.copy() for name, part in self.task.state.items()}}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Stand where `get_state` was taken."""
         self._seed = int(state['seed'])
-        self.backend.place(np.arange(self.num_envs), state['poses'])
+        everyone = np.arange(self.num_envs)
+        self.backend.place(everyone, state['poses'])
         for name in self._STATE:
             getattr(self, name)[:] = state[name.strip('_')]
+        for name, part in self.backend.objects._asdict().items():
+            part[:] = state[f'objects_{name}']
+        for name, part in self.task.state.items():
+            part[:] = state[f'task_{name}']
+        self.backend.dress(everyone, self._seed, Stream.APPEARANCE, everyone, self._episode)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start a new episode everywhere; a seed also restarts the count of episodes."""
@@ -177,7 +228,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._begin(np.arange(self.num_envs))
         self._done[:] = False
         none = np.zeros(self.num_envs, bool)
-        return self._observe(reset=np.ones(self.num_envs, bool), success=none, collided=none)
+        return self._result(self._look(), reset=~none, success=none, collided=none)
 
     def step(self, actions):
         """One decision in every environment that is not being reset."""
@@ -190,73 +241,111 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         reset = self._done.copy()
         acting = np.nonzero(~reset)[0]
         collided = np.zeros(self.num_envs, bool)
-        reward = np.zeros(self.num_envs, np.float32)
-        success = np.zeros(self.num_envs, bool)
+        before = self._distance.copy()
         if len(acting):
-            delta = self._deltas[actions[acting]]
-            if self.config.noise:
-                delta = motion_noise(delta, self._sizes[actions[acting]], normal(
-                    self._seed, Stream.MOTION_NOISE, acting, self._episode[acting],
-                    self._step[acting]))
-            motion = self.backend.move(delta, acting)
-            collided[acting] = motion.collided
-            self._path_length[acting] += np.hypot(motion.delta[:, 0], motion.delta[:, 1])
-            before = self._distance.copy()
-            self._measure()
-            success = tasks.arrived(self._distance, self._heading_error()) & ~reset
-            sparse = tasks.sparse_reward(success)
-            reward = np.where(reset, 0, sparse + tasks.shaping_reward(
-                before, self._distance, collided, progress=self.config.progress_reward,
-                collision=self.config.collision_reward)).astype(np.float32)
-            self._last_action[acting] = actions[acting]
-            self._last_reward[acting] = sparse[acting]
-            self._step[acting] += 1
+            collided[acting] = self._drive(actions[acting], acting)
         if reset.any():
             self._begin(np.nonzero(reset)[0])
-        terminated = success
+        self._measure(acting)
+        frames = self._look()
+        objects = self.backend.objects
+        verdict = self.task.judge(tasks.Situation(
+            ~reset, self._distance, self._heading_error(), self.backend.poses, frames.labels,
+            self.backend.object_models(), objects.pose[:, :, :2]))
+        objects.scene[verdict.removed] = -1
+        reward = np.where(reset, 0, verdict.reward + tasks.shaping_reward(
+            before, self._distance, collided, progress=self.config.progress_reward,
+            collision=self.config.collision_reward)).astype(np.float32)
+        self._last_action[acting] = actions[acting]
+        self._last_reward[acting] = verdict.reward[acting]
+        self._step[acting] += 1
+        terminated = verdict.success
         truncated = ~terminated & ~reset & (self._step >= self.config.max_decisions)
         self._done = terminated | truncated
-        observation, info = self._observe(reset, success, collided)
+        observation, info = self._result(frames, reset, verdict.success, collided)
         return observation, reward, terminated, truncated, info
 
+    def _drive(self, actions: np.ndarray, acting: np.ndarray) -> np.ndarray:
+        """Move some robots; whether they touched something."""
+        delta = self._deltas[actions]
+        if self.config.noise:
+            delta = motion_noise(delta, self._sizes[actions], normal(
+                self._seed, Stream.MOTION_NOISE, acting, self._episode[acting],
+                self._step[acting]))
+        motion = self.backend.move(self._as_driven(delta, acting), acting)
+        self._path_length[acting] += np.hypot(motion.delta[:, 0], motion.delta[:, 1])
+        return motion.collided
+
+    def _as_driven(self, delta: np.ndarray, env_ids: np.ndarray) -> np.ndarray:
+        """What a base with worn wheels on a smooth floor makes of displacements [K,4]."""
+        config = self.config.randomisation
+        share = self._motion_scale[env_ids]
+        if config.slip:
+            counter = (self._seed, Stream.SLIP, env_ids, self._episode[env_ids],
+                       self._step[env_ids])
+            part = key(*counter) % np.uint64(1000) / 1000.0
+            share = np.where(uniform(*counter) < config.slip, part, 1.0) * share
+        delta = delta.copy()
+        delta[:, :3] *= share[:, None]
+        return delta
+
     def _begin(self, env_ids: np.ndarray) -> None:
-        """Draw goal and start of a new episode."""
+        """Draw goal, start, light and base of new episodes."""
         self._episode[env_ids] += 1
         for n in env_ids:
-            first, count = self._goal_range[self.house_index[n]]
             counter = (self._seed, int(n), int(self._episode[n]))
-            if self.config.one_goal_per_env:
-                local = (n // len(self.houses)) % count
-            else:
-                local = tasks.draw_goal(count, *counter)
-            shown = local
-            if self._shown == WRONG:
-                shown = tasks.draw_wrong_goal(count, local, *counter)
-            self._goal[n] = first + local
-            self._shown_goal[n] = self.blank_goal if self._shown == BLANK else first + shown
-            start = self.goal_fields[first + local].start(self._tau, *counter)
-            self.backend.place(np.array([n]), start[None])
+            episode = self.task.begin(int(n), int(self.house_index[n]), counter, self._tau,
+                                      self._mode)
+            variant = tasks.draw_index(self._variants, self._seed, Stream.GOAL_VARIANT,
+                                       *counter[1:])
+            self._goal[n], self._goal_yaw[n] = episode.goal, episode.goal_yaw
+            self._shown_goal[n] = (self.blank_goal if episode.shown < 0
+                                   else episode.shown * self._variants + variant)
+            self.backend.place(np.array([n]), episode.start[None])
+            self.backend.set_objects(n, episode.objects)
+            self._maps[n] = np.inf
+            if episode.field is not None:
+                rows, columns = episode.field.values.shape
+                self._maps[n, :rows, :columns] = episode.field.values
+        self.backend.dress(env_ids, self._seed, Stream.APPEARANCE, env_ids,
+                           self._episode[env_ids])
+        low, high = self.config.randomisation.motion_scale
+        self._motion_scale[env_ids] = low + (high - low) * uniform(
+            self._seed, Stream.BASE, env_ids, self._episode[env_ids])
         self._step[env_ids] = 0
         self._path_length[env_ids] = 0.0
         self._last_action[env_ids] = -1
         self._last_reward[env_ids] = 0.0
-        self._measure()
+        self._measure(env_ids)
         self._start_distance[env_ids] = self._distance[env_ids]
 
-    def _measure(self) -> None:
-        """Geodesic distance of every robot to its goal."""
-        for goal in np.unique(self._goal):
-            rows = self._goal == goal
-            self._distance[rows] = self.goal_fields[goal].field.distance(
-                self.backend.poses[rows, :2])
+    def _measure(self, env_ids: np.ndarray) -> None:
+        """Geodesic distance of robots to their goals; 0 where the task has none."""
+        if self.config.task != 'collect':
+            self._distance[env_ids] = self._distance_of(env_ids, self.backend.poses[env_ids, :2])
+
+    def _distance_of(self, env_ids: np.ndarray, xy: np.ndarray) -> np.ndarray:
+        cells = (xy - self._origins[env_ids]) / CELL - 0.5
+        return interpolate(self._maps, np.asarray(env_ids), cells[:, 0], cells[:, 1])
 
     def _heading_error(self) -> np.ndarray:
-        return tasks.heading_error(self.backend.poses[:, 2], self.goal_poses[self._goal, 2])
+        return tasks.heading_error(self.backend.poses[:, 2], self._goal_yaw)
 
-    def _observe(self, reset, success, collided):
-        frames = self.backend.observe()
+    def _look(self) -> Frames:
+        everyone = np.arange(self.num_envs)
+        return self.backend.observe(keys=key(self._seed, Stream.SENSOR, everyone, self._episode,
+                                             self._step))
+
+    def _result(self, frames: Frames, reset, success, collided):
+        image = frames.rgb.copy()
+        if self.config.randomisation.late_picture:
+            late = (uniform(self._seed, Stream.LATE_PICTURE, np.arange(self.num_envs),
+                            self._episode, self._step)
+                    < self.config.randomisation.late_picture) & (self._step > 0)
+            image[late] = self._last_image[late]
+            self._last_image[:] = image
         observation = {
-            'image': frames.rgb.copy(),
+            'image': image,
             'goal_index': self._shown_goal.copy(),
             'last_action': self._last_action.copy(),
             'last_reward': self._last_reward.copy(),
@@ -284,12 +373,15 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         return observation, info
 
     def oracle_actions(self) -> np.ndarray:
-        """The next action [N] on a shortest path to the goal pose, from the simulator's geometry.
+        """The next action [N] on a shortest path to the goal, from the simulator's geometry.
 
         Far from the goal: the heading, among those that rotations reach, whose forward move comes
         closest to the goal, charging `TURN_COST` a rotation and `BLOCKED_COST` for contacts.
         At the goal: turn to its yaw.
         """
+        if self.config.task == 'collect':
+            raise UserError('the shortest-path action needs a task with a goal', 'collect',
+                            'use another control')
         table = {name: index for index, name in enumerate(self.action_names)}
         for name in ('forward', 'rotate_left', 'rotate_right'):
             if name not in table:
@@ -302,12 +394,12 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         actions = np.empty(self.num_envs, np.int64)
         for n in range(self.num_envs):
             yaw = self.backend.poses[n, 2]
-            if self._distance[n] <= tasks.ARRIVAL_RADIUS:
-                wanted = tasks.wrap_angle(self.goal_poses[self._goal[n], 2] - yaw)
+            if self.config.task == 'image' and self._distance[n] <= tasks.ARRIVAL_RADIUS:
+                wanted = tasks.wrap_angle(self._goal_yaw[n] - yaw)
             else:
                 ends = self.backend.world.reach(n, yaw + turns * turn, length)
                 cut = length - np.hypot(*(ends - self.backend.poses[n, :2]).T)
-                cost = (self.goal_fields[self._goal[n]].field.distance(ends)
+                cost = (self._distance_of(np.full(len(ends), n), ends)
                         + TURN_COST * np.abs(turns) + BLOCKED_COST * cut)
                 wanted = turns[np.argmin(cost)] * turn
             if abs(wanted) < turn / 2:

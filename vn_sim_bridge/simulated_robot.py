@@ -16,9 +16,10 @@ from vn_nav.robot import RobotSpec
 from vn_sim_bridge import tasks
 from vn_sim_bridge.backends.base import Frames
 from vn_sim_bridge.backends.house import HouseBackend
-from vn_sim_bridge.counter_random import Stream, normal
+from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.houses.house import Goal
 from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.randomisation import Randomisation
 from vn_sim_bridge.world import motion_noise, nominal_sizes
 
 TICK = 0.05  # s of simulated time
@@ -61,13 +62,17 @@ class SimulatedRobot:
         seed: of starts, goals and noise. Episode e starts as environment e of a `NavigationEnv`
             with the same seed does.
         max_decisions: limit of an episode.
+        randomisation: of light, camera and base; default: nothing varies.
     """
 
     def __init__(self, house: int, rooms: int, *, robot: RobotSpec, size: int = 84,
-                 noise: bool = True, seed: int = 0, max_decisions: int = 300):
+                 noise: bool = True, seed: int = 0, max_decisions: int = 300,
+                 randomisation: Randomisation | None = None):
         self.house = generate_house(house, rooms=rooms)
         self.robot, self.noise, self.seed, self.max_decisions = robot, noise, seed, max_decisions
-        self.backend = HouseBackend([self.house], [0], robot=robot, size=size)
+        self.randomisation = randomisation or Randomisation()
+        self.backend = HouseBackend([self.house], [0], robot=robot, size=size,
+                                    randomisation=self.randomisation)
         self.fields = [tasks.GoalField(self.house, goal, 1.0) for goal in self.house.goals]
         self._nominal = nominal_sizes(robot)
         self.tick_count = 0
@@ -77,6 +82,8 @@ class SimulatedRobot:
         self._field = self.fields[0]
         self._in_decision = False
         self._touched = False
+        self._share = self._motion_scale = 1.0  # metres driven per metre asked for
+        self._shown: Frames | None = None
         # Compile the motion now, not when the first command is in force.
         self.backend.move(np.zeros((1, 4)))
 
@@ -115,6 +122,11 @@ class SimulatedRobot:
         start = field.start(1.0, *counter)
         self.backend.place(np.array([0]), start[None])
         self._in_decision = self._touched = False
+        self.backend.dress(np.array([0]), self.seed, Stream.APPEARANCE, index, 0)
+        low, high = self.randomisation.motion_scale
+        self._motion_scale = low + (high - low) * float(
+            uniform(self.seed, Stream.BASE, index, 0))
+        self._shown = None
         self.episode = Episode(index, chosen, tuple(float(v) for v in start),
                                self.distance(), self.time)
         return self.episode
@@ -130,8 +142,24 @@ class SimulatedRobot:
         return tasks.GoalField(self.house, goal, 1.0)
 
     def goal_frames(self) -> Frames:
-        """The goal picture (and its depth and labels)."""
-        return self.backend.view(np.zeros(1, np.int64), np.array([self.goal.pose]))
+        """The goal picture (and its depth and labels), in a light of its own."""
+        index, goal = self.episode.index, self.episode.goal
+        variants = self.randomisation.pictures_per_goal
+        variant = (index if goal < 0 else
+                   int(uniform(self.seed, Stream.GOAL_VARIANT, index, 0) * variants))
+        counter = (self.seed, Stream.GOAL_APPEARANCE, np.array([goal]), np.array([variant]))
+        return self.backend.view(np.zeros(1, np.int64), np.array([self.goal.pose]), None,
+                                 self.backend.appearance(*counter), key(*counter, 99))
+
+    def observe(self) -> Frames:
+        """The camera's picture; with a late camera at times the one before."""
+        index = self.episode.index if self.episode else 0
+        counter = (self.seed, Stream.LATE_PICTURE, index, 0, self.tick_count)
+        if self._shown is None or uniform(*counter) >= self.randomisation.late_picture:
+            frames = self.backend.observe(keys=np.atleast_1d(
+                key(self.seed, Stream.SENSOR, index, 0, self.tick_count)))
+            self._shown = Frames(*(part.copy() for part in frames))
+        return self._shown
 
     def distance(self) -> float:
         """Geodesic distance to the goal [m]."""
@@ -150,9 +178,12 @@ class SimulatedRobot:
         self.velocity = np.asarray(velocity, float)
         if not self.velocity.any():
             return self.end_decision() if self._in_decision else None
-        self._in_decision = True
+        if not self._in_decision:
+            self._in_decision = True
+            self._share = self._motion_scale * self._slip()
         wanted = self.velocity * TICK
-        delta = self._with_noise(wanted) if self.noise else wanted
+        delta = self._with_noise(wanted) if self.noise else wanted.copy()
+        delta[:3] *= self._share
         motion = self.backend.move(delta[None])
         done = motion.delta[0]
         length = math.hypot(delta[0], delta[1])
@@ -170,12 +201,20 @@ class SimulatedRobot:
         self.velocity[:2] *= share
         return None
 
+    def _slip(self) -> float:
+        """The share of a new decision's motion that the wheels turn into driving."""
+        counter = (self.seed, Stream.SLIP, self.episode.index if self.episode else 0, 0,
+                   self.tick_count)
+        if uniform(*counter) >= self.randomisation.slip:
+            return 1.0
+        return float(key(*counter) % np.uint64(1000)) / 1000.0
+
     def _with_noise(self, wanted: np.ndarray) -> np.ndarray:
         axis = int(np.argmax(np.abs(wanted)))
-        key = ('+' if wanted[axis] > 0 else '-') + ('dx', 'dy', 'dyaw', 'dpitch')[axis]
+        name = ('+' if wanted[axis] > 0 else '-') + ('dx', 'dy', 'dyaw', 'dpitch')[axis]
         # A direction without an action of its own (a joystick driving sideways) is as noisy as
         # the thesis's largest step.
-        nominal = self._nominal.get(key, 0.5)
+        nominal = self._nominal.get(name, 0.5)
         number = normal(self.seed, Stream.MOTION_NOISE, 0, self.episode.index if self.episode
                         else 0, self.tick_count)
         return motion_noise(wanted[None], np.array([nominal]), np.atleast_1d(number))[0]

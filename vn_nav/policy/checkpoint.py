@@ -33,6 +33,7 @@ INFO = {
     'decoding': 'sample',  # the rule that `results` were measured with
     'houses': [],  # seeds
     'rooms': None,  # of each house
+    'randomisation': 'none',  # of light, camera and base: a name, or a file's path
     'seed': None,
     'frames': 0,  # agent decisions
     'minutes': 0.0,  # wall-clock of training

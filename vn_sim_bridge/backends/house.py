@@ -9,8 +9,13 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.backends.base import Capabilities, Frames, Motion
+from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.house import House
-from vn_sim_bridge.render.rasterizer import Rasterizer
+from vn_sim_bridge.houses.objects import object_scene
+from vn_sim_bridge.randomisation import Appearance, Randomisation, draw_appearance
+from vn_sim_bridge.render.rasterizer import Lights, Objects, Rasterizer
+from vn_sim_bridge.render.sensor import expose
+from vn_sim_bridge.tasks import Placed
 from vn_sim_bridge.world import WORLD_VERSION, World
 
 
@@ -23,13 +28,16 @@ class HouseBackend:
         robot: footprint and camera.
         size: side of the square pictures [pixels].
         threads: threads that draw.
+        randomisation: what `dress` draws light and camera from; default: nothing varies.
+        models: names of the objects that may stand in the houses; objects: most at a time.
     """
 
     capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True)
     world_version = WORLD_VERSION
 
     def __init__(self, houses: Sequence[House], house_index: Sequence[int], *, robot: RobotSpec,
-                 size: int = 84, threads: int = 1):
+                 size: int = 84, threads: int = 1, randomisation: Randomisation | None = None,
+                 models: Sequence[str] = (), objects: int = 0):
         self.houses = list(houses)
         for house in self.houses:
             if robot.footprint_radius > house.footprint_radius:
@@ -39,9 +47,16 @@ class HouseBackend:
         self.robot = robot
         self.world = World(self.houses, np.asarray(house_index), robot.footprint_radius)
         self.num_envs = len(self.world.house_index)
-        self._renderer = Rasterizer([house.scene for house in self.houses], size, threads=threads)
+        self.randomisation = randomisation or Randomisation()
+        self._renderer = Rasterizer([*(house.scene for house in self.houses),
+                                     *map(object_scene, models)], size, threads=threads)
+        self.objects = Objects(np.full((self.num_envs, objects), -1, np.int64),
+                               np.zeros((self.num_envs, objects, 4)),
+                               np.zeros((self.num_envs, objects), np.int64))
         self._all = np.arange(self.num_envs)
         self._frames = None
+        self._appearance = None
+        self.dress(self._all, 0, Stream.APPEARANCE, self._all, 0 * self._all)
 
     @property
     def poses(self) -> np.ndarray:
@@ -56,16 +71,86 @@ class HouseBackend:
         """Displace robots by [K,4] in their own frames, up to the first contact."""
         return Motion(*self.world.move(delta, self._all if env_ids is None else env_ids))
 
-    def observe(self, env_ids: np.ndarray | None = None) -> Frames:
-        """Pictures of the robots' cameras. All robots: one buffer, valid until the next call."""
-        if env_ids is not None:
-            return self.view(self.world.house_index[env_ids], self.world.poses[env_ids])
-        self._frames = self.view(self.world.house_index, self.world.poses, self._frames)
-        return self._frames
+    def appearance(self, seed: int, stream: Stream, env, episode) -> Appearance:
+        """Light and camera of some episodes, or of some goal pictures."""
+        return draw_appearance(self.randomisation, self._renderer.rooms, seed, stream, env,
+                               episode)
 
-    def view(self, house_index: np.ndarray, poses: np.ndarray,
-             out: Frames | None = None) -> Frames:
-        """Pictures from any poses [K,4] in the given houses [K]."""
-        cameras = np.column_stack([poses[:, :2], np.full(len(poses), self.robot.camera_height),
-                                   poses[:, 2], poses[:, 3] + self.robot.camera_pitch])
-        return Frames(*self._renderer.render(house_index, cameras, self.robot.camera_fov, out))
+    def dress(self, env_ids: np.ndarray, seed: int, stream: Stream, env, episode) -> None:
+        """Draw light and camera of robots [K] anew, for the counters [K] of their episodes."""
+        drawn = self.appearance(seed, stream, env, episode)
+        if self._appearance is None:
+            self._appearance = drawn
+            return
+        for part, rows in zip(self._appearance, drawn, strict=True):
+            part[env_ids] = rows
+
+    def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
+        """Put these objects, and no others, into the house of one robot."""
+        house = self.houses[self.world.house_index[env_id]]
+        self.objects.scene[env_id] = -1
+        for m, item in enumerate(placed):
+            self.objects.scene[env_id, m] = len(self.houses) + item.model
+            self.objects.pose[env_id, m] = item.x, item.y, 0.0, item.yaw
+            self.objects.room[env_id, m] = house.room_index(item.x, item.y)
+
+    def object_models(self) -> np.ndarray:
+        """[N,M] int64: which model each object is; -1: absent."""
+        return np.where(self.objects.scene >= 0, self.objects.scene - len(self.houses), -1)
+
+    def observe(self, env_ids: np.ndarray | None = None,
+                keys: np.ndarray | None = None) -> Frames:
+        """Pictures of the robots' cameras. All robots: one buffer, valid until the next call.
+
+        Args:
+            env_ids: [K] which robots; default all.
+            keys: [K] uint64, of the sensor's noise; default: one noise for every call.
+        """
+        ids = self._all if env_ids is None else env_ids
+        appearance = Appearance(*(part[ids] for part in self._appearance))
+        out = self._frames if env_ids is None else None
+        objects = Objects(*(part[ids] for part in self.objects))
+        frames = self._draw(self.world.house_index[ids], self.world.poses[ids], out, appearance,
+                            keys, objects)
+        if env_ids is None:
+            self._frames = frames
+        return frames
+
+    def view(self, house_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
+             appearance: Appearance | None = None, keys: np.ndarray | None = None,
+             placed: Sequence[Sequence[Placed]] | None = None) -> Frames:
+        """Pictures from any poses [K,4] in the given houses [K]; by default in standard light.
+
+        Args:
+            out: buffers to fill; keys: as in `observe`.
+            appearance: light and camera of each picture.
+            placed: the objects in each picture; default none.
+        """
+        if appearance is None:
+            appearance = draw_appearance(Randomisation(), self._renderer.rooms, 0,
+                                         Stream.APPEARANCE, np.arange(len(poses)), 0)
+        objects = None
+        if placed is not None and (most := max(map(len, placed))):
+            objects = Objects(np.full((len(poses), most), -1, np.int64),
+                              np.zeros((len(poses), most, 4)),
+                              np.zeros((len(poses), most), np.int64))
+            for k, items in enumerate(placed):
+                for m, item in enumerate(items):
+                    objects.scene[k, m] = len(self.houses) + item.model
+                    objects.pose[k, m] = item.x, item.y, 0.0, item.yaw
+                    objects.room[k, m] = self.houses[house_index[k]].room_index(item.x, item.y)
+        return self._draw(house_index, poses, out, appearance, keys, objects)
+
+    def _draw(self, house_index, poses, out, appearance, keys, objects) -> Frames:
+        robot = self.robot
+        cameras = np.column_stack([poses[:, :2], robot.camera_height + appearance.height,
+                                   poses[:, 2],
+                                   poses[:, 3] + robot.camera_pitch + appearance.pitch])
+        frames = Frames(*self._renderer.render(
+            house_index, cameras, robot.camera_fov + appearance.fov, out,
+            lights=Lights(appearance.cube, appearance.lamps), objects=objects))
+        if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:
+            if keys is None:
+                keys = np.arange(len(poses)).astype(np.uint64)
+            expose(frames.rgb, appearance.noise, appearance.blur, keys)
+        return frames

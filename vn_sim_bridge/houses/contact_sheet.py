@@ -74,10 +74,10 @@ def house_map(house: House) -> np.ndarray:
                     cv2.LINE_AA)
 
     fill(outline, FLOOR)
+    for obstacle in sorted(house.obstacles, key=lambda o: o.label != 'outside'):
+        fill(obstacle.rect, {'wall': WALL, 'outside': PAPER}.get(obstacle.label, WOOD))
     for obstacle in house.obstacles:
-        fill(obstacle.rect, WALL if obstacle.label == 'wall' else WOOD)
-    for obstacle in house.obstacles:
-        if obstacle.label != 'wall':
+        if obstacle.label not in ('wall', 'outside'):
             write(obstacle.label.replace('_', ' '), obstacle.rect.x0 + 0.05,
                   (obstacle.rect.y0 + obstacle.rect.y1) / 2, 0.34)
     for room in house.rooms:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -15,6 +16,7 @@ from vn_sim_bridge.houses.layout import Rect
 from vn_sim_bridge.scene import Scene
 
 CELL = 0.1  # m, side of a cell of the floor map
+FAR = 1e9  # cells: not reached
 FREE_MARGIN = 0.02  # m beyond the footprint that a cell's centre keeps from obstacles
 
 
@@ -79,6 +81,12 @@ class House:
                 return room.name
         return ''
 
+    def room_index(self, x: float, y: float) -> int:
+        """Index of the room nearest to a point."""
+        gaps = [math.hypot(max(r.x0 - x, 0, x - r.x1), max(r.y0 - y, 0, y - r.y1))
+                for r in (room.rect for room in self.rooms)]
+        return int(np.argmin(gaps))
+
 
 class FloorMap(NamedTuple):
     """A grid of cells; cell [i, j] has its centre at origin + ((j + 0.5), (i + 0.5)) * CELL."""
@@ -138,8 +146,24 @@ class DistanceField:
 
     def __init__(self, floor: FloorMap, x: float, y: float):
         self.floor = floor
-        self.values = _fast_sweeping(floor.free, (x - floor.origin[0]) / CELL - 0.5,
-                                     (y - floor.origin[1]) / CELL - 0.5)  # [rows, columns] m
+        self.values = _around(floor.free, (x - floor.origin[0]) / CELL - 0.5,
+                              (y - floor.origin[1]) / CELL - 0.5)  # [rows, columns] m, float32
+        _fast_sweeping(floor.free, self.values)
+
+    @classmethod
+    def to_rectangles(cls, floor: FloorMap, rects: Sequence[Rect]) -> DistanceField:
+        """Distances to the nearest free cell within some rectangles."""
+        self = cls.__new__(cls)
+        self.floor = floor
+        rows, columns = floor.free.shape
+        y = floor.origin[1] + (np.arange(rows)[:, None] + 0.5) * CELL
+        x = floor.origin[0] + (np.arange(columns)[None, :] + 0.5) * CELL
+        inside = np.zeros(floor.free.shape, bool)
+        for x0, y0, x1, y1 in rects:
+            inside |= (x0 <= x) & (x <= x1) & (y0 <= y) & (y <= y1)
+        self.values = np.where(inside & floor.free, 0.0, FAR).astype(np.float32)
+        _fast_sweeping(floor.free, self.values)
+        return self
 
     @property
     def maximum(self) -> float:
@@ -148,15 +172,16 @@ class DistanceField:
 
     def distance(self, xy: np.ndarray) -> np.ndarray:
         """Distance of positions [N,2] to the field's point [m]; inf where it cannot be reached."""
-        return _interpolate(self.values, (xy[:, 0] - self.floor.origin[0]) / CELL - 0.5,
-                            (xy[:, 1] - self.floor.origin[1]) / CELL - 0.5)
+        return interpolate(self.values[None], np.zeros(len(xy), np.int64),
+                           (xy[:, 0] - self.floor.origin[0]) / CELL - 0.5,
+                           (xy[:, 1] - self.floor.origin[1]) / CELL - 0.5)
 
 
 @numba.njit(cache=True)
-def _fast_sweeping(free, goal_column, goal_row):
+def _around(free, goal_column, goal_row):
+    """Distances [cells] close to a point; FAR elsewhere."""
     rows, columns = free.shape
-    far = 1e9
-    t = np.full((rows, columns), far)
+    t = np.full((rows, columns), np.float32(FAR))
     # Exact distances around the goal: the grid's first steps would be the least accurate.
     reach = 3
     i0, j0 = int(round(goal_row)), int(round(goal_column))
@@ -172,6 +197,14 @@ def _fast_sweeping(free, goal_column, goal_row):
                         clear = False
                 if clear:
                     t[i, j] = distance
+    return t
+
+
+@numba.njit(cache=True)
+def _fast_sweeping(free, t):
+    """Fill in distances [cells] from where they are known, then turn them into metres."""
+    rows, columns = free.shape
+    far = FAR
     changed = True
     while changed:
         changed = False
@@ -190,21 +223,24 @@ def _fast_sweeping(free, goal_column, goal_row):
                         value = min(a, b) + 1.0
                     else:
                         value = 0.5 * (a + b + math.sqrt(2.0 - (a - b) * (a - b)))
-                    if value < t[i, j] - 1e-6:
+                    if value < t[i, j] - 1e-4:
                         t[i, j] = value
                         changed = True
     for i in range(rows):
         for j in range(columns):
             t[i, j] = t[i, j] * CELL if t[i, j] < far else np.inf
-    return t
 
 
 @numba.njit(cache=True)
-def _interpolate(values, columns, rows):
-    """Bilinear where all four neighbours are free, else the best detour over a free neighbour."""
-    height, width = values.shape
+def interpolate(stack, which, columns, rows):
+    """Distances [K] at fractional cells, from maps `which` [K] of a stack [G,rows,columns].
+
+    Bilinear where all four neighbours are free, else the best detour over a free neighbour.
+    """
+    height, width = stack.shape[1:]
     out = np.empty(len(columns))
     for n in range(len(columns)):
+        values = stack[which[n]]
         x, y = columns[n], rows[n]
         j, i = int(math.floor(x)), int(math.floor(y))
         if 0 <= i < height - 1 and 0 <= j < width - 1:

@@ -1,7 +1,8 @@
-"""Floor plans: a rectangle split into rooms, and the doors that join them."""
+"""Floor plans: one or two rectangular wings split into rooms, and the doors that join them."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -109,25 +110,59 @@ def place_doors(rooms: list[Rect], rng: np.random.Generator,
     return doors if len(set(component)) == 1 else None
 
 
-def wall_obstacles(outline: Rect, rooms: list[Rect], doors: list[Door]) -> list[Rect]:
+def wings(rooms: int, area: float, rng: np.random.Generator, count: int) -> list[list[Rect]]:
+    """The rooms of each wing; a second wing stands at the east or north side of the first.
+
+    Args:
+        rooms: in all; area: mean area of a room [m^2]; count: 1 or 2 wings.
+    """
+    first = rooms if count == 1 else rooms - max(1, round(rooms * rng.uniform(0.3, 0.45)))
+    size = first * area * rng.uniform(0.95, 1.15)
+    aspect = rng.uniform(0.75, 1.35)
+    main = Rect(0.0, 0.0, math.sqrt(size * aspect), math.sqrt(size / aspect))
+    found = [split(main, first, rng)]
+    if count == 2:
+        size = (rooms - first) * area * rng.uniform(0.95, 1.15)
+        along = max(MIN_SIDE, math.sqrt(size * rng.uniform(0.6, 1.2)))
+        east = rng.random() < 0.5
+        side = main.y1 if east else main.x1
+        along = min(along, side - 1.0)  # a wing as long as the house would be no wing
+        deep = max(MIN_SIDE, size / along)
+        start = 0.0 if rng.random() < 0.5 else side - along
+        wing = (Rect(main.x1, start, main.x1 + deep, start + along) if east
+                else Rect(start, main.y1, start + along, main.y1 + deep))
+        found.append(split(wing, rooms - first, rng))
+    return found
+
+
+def bounds(rects: list[Rect]) -> Rect:
+    """The smallest rectangle around some."""
+    return Rect(min(r.x0 for r in rects), min(r.y0 for r in rects), max(r.x1 for r in rects),
+                max(r.y1 for r in rects))
+
+
+def outside(outline: Rect, parts: list[Rect]) -> list[Rect]:
+    """What of the outline no wing covers, as rectangles."""
+    xs = sorted({r.x0 for r in [outline, *parts]} | {r.x1 for r in [outline, *parts]})
+    ys = sorted({r.y0 for r in [outline, *parts]} | {r.y1 for r in [outline, *parts]})
+    cells = [Rect(x0, y0, x1, y1) for x0, x1 in zip(xs, xs[1:], strict=False)
+             for y0, y1 in zip(ys, ys[1:], strict=False)]
+    return [c for c in cells if c.area > 1e-6 and not any(
+        r.x0 - 1e-6 <= c.x0 and c.x1 <= r.x1 + 1e-6 and r.y0 - 1e-6 <= c.y0
+        and c.y1 <= r.y1 + 1e-6 for r in parts)]
+
+
+def wall_obstacles(rooms: list[Rect], doors: list[Door]) -> list[Rect]:
     """The footprint of every wall, with the doors left open."""
     half = WALL / 2
-    found = [
-        Rect(outline.x0 - half, outline.y0 - half, outline.x1 + half, outline.y0 + half),
-        Rect(outline.x0 - half, outline.y1 - half, outline.x1 + half, outline.y1 + half),
-        Rect(outline.x0 - half, outline.y0 - half, outline.x0 + half, outline.y1 + half),
-        Rect(outline.x1 - half, outline.y0 - half, outline.x1 + half, outline.y1 + half),
-    ]
-    for contact in contacts(rooms):
-        openings = [d for d in doors if (d.first, d.second) == (contact.first, contact.second)
-                    and d.axis == contact.axis]
-        edges = [contact.low - half]
-        for door in sorted(openings, key=lambda d: d.low):
-            edges += [door.low, door.high]
-        edges.append(contact.high + half)
-        for low, high in zip(edges[::2], edges[1::2], strict=True):
-            if contact.axis == 0:
-                found.append(Rect(low, contact.at - half, high, contact.at + half))
-            else:
-                found.append(Rect(contact.at - half, low, contact.at + half, high))
-    return found
+    found = []
+    for x0, y0, x1, y1 in rooms:  # outer walls are walls of one room, inner ones of two
+        for axis, at, low, high in ((0, y0, x0, x1), (0, y1, x0, x1), (1, x0, y0, y1),
+                                    (1, x1, y0, y1)):
+            openings = sorted((d.low, d.high) for d in doors if d.axis == axis
+                              and abs(d.at - at) < 1e-6 and d.low < high and low < d.high)
+            edges = [low - half, *(edge for opening in openings for edge in opening), high + half]
+            for start, end in zip(edges[::2], edges[1::2], strict=True):
+                found.append(Rect(start, at - half, end, at + half) if axis == 0
+                             else Rect(at - half, start, at + half, end))
+    return sorted(set(found))

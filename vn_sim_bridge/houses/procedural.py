@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.houses.furniture import (
-    FABRICS,
-    KINDS,
-    LABEL,
-    ROOM_PROGRAMMES,
-    WHITES,
-    WOODS,
-    Piece,
-)
+from vn_sim_bridge.houses.bake import light_baker
+from vn_sim_bridge.houses.furniture import KINDS, OPTIONAL_PROBABILITY, ROOM_PROGRAMMES, TALL
 from vn_sim_bridge.houses.house import (
     FREE_MARGIN,
     Goal,
@@ -27,82 +18,108 @@ from vn_sim_bridge.houses.house import (
     grid_of,
     main_component,
 )
-from vn_sim_bridge.houses.layout import WALL, Door, Rect, place_doors, split, wall_obstacles
-from vn_sim_bridge.houses.textures import PAINTINGS, TEXTURES
+from vn_sim_bridge.houses.labels import LABEL
+from vn_sim_bridge.houses.layout import (
+    WALL,
+    Door,
+    Rect,
+    bounds,
+    contacts,
+    outside,
+    place_doors,
+    wall_obstacles,
+    wings,
+)
+from vn_sim_bridge.houses.piece import Piece
+from vn_sim_bridge.houses.splits import look_of
+from vn_sim_bridge.houses.textures import TEXTURES, texture_library
 from vn_sim_bridge.houses.viewpoints import choose_goals
 from vn_sim_bridge.scene import SceneBuilder
 
 HEIGHT = 2.6  # m, of rooms
 DOOR_HEIGHT = 2.05  # m
 ROOM_AREA = 15.0  # m^2, mean area of a room between wall centres
-MAX_ROOMS = 8
+MAX_ROOMS = 12
+TWO_WINGS_FROM = 4  # rooms
+TWO_WINGS = 0.4  # share of such houses
+GAP = 0.01  # m between furniture and walls
 DOOR_SPACE = 0.75  # m in front of a door that furniture leaves free
 FOOTPRINT_RADIUS = 0.18  # m, the standard robot
 
 # Room types in the order in which a house gets them.
 ROOM_ORDER = ('living_room', 'kitchen', 'bedroom', 'bathroom', 'office', 'dining_room', 'bedroom',
-              'hall')
-WALL_TEXTURES = ('plaster', 'plain', 'stripes', 'dots', 'brick', 'plaster')
-FLOOR_TEXTURES = ('planks', 'tiles', 'checker', 'marble', 'fabric')
-WALL_COLOURS = ((0.93, 0.90, 0.82), (0.80, 0.86, 0.90), (0.86, 0.90, 0.78), (0.94, 0.82, 0.76),
-                (0.85, 0.80, 0.90), (0.96, 0.92, 0.66), (0.72, 0.82, 0.80), (0.90, 0.70, 0.62))
+              'hall', 'bathroom', 'bedroom', 'office', 'living_room')
 
 
-def generate_house(seed: int, *, rooms: int = 5) -> House:
+def generate_house(seed: int, *, rooms: int = 5, goals_per_room: int = 1) -> House:
     """Build a house.
 
     Args:
-        seed: any integer from 0 on; equal seeds give equal houses.
-        rooms: number of rooms, 1 to 8.
+        seed: 0 to 12,999 (see `splits`); equal seeds give equal houses.
+        rooms: number of rooms, 1 to 12. From four on there may be a second wing.
+        goals_per_room: places in each room where goal pictures are taken.
 
     Raises:
         UserError: a seed or a number of rooms outside its range.
     """
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise UserError('the seed of a house is a whole number from 0 on', seed, 'choose another')
+    if not isinstance(seed, (int, np.integer)):
+        raise UserError('the seed of a house is a whole number', seed, 'choose another')
+    look = look_of(seed)
     if not 1 <= rooms <= MAX_ROOMS:
         raise UserError(f'a house has 1 to {MAX_ROOMS} rooms', rooms, 'choose a number in range')
+    if not 1 <= goals_per_room <= 16:
+        raise UserError('a room has 1 to 16 goals', goals_per_room, 'choose a number in range')
     rng = np.random.default_rng([seed, rooms])
+    count = 2 if rooms >= TWO_WINGS_FROM and rng.random() < TWO_WINGS else 1
     while True:  # a floor plan without doors for every room is drawn again; seldom more than twice
-        area = rooms * ROOM_AREA * rng.uniform(0.95, 1.15)
-        aspect = rng.uniform(0.75, 1.35)
-        outline = Rect(0.0, 0.0, math.sqrt(area * aspect), math.sqrt(area / aspect))
-        cells = split(outline, rooms, rng)
+        parts = wings(rooms, ROOM_AREA, rng, count)
+        cells = [cell for part in parts for cell in part]
         doors = place_doors(cells, rng)
         if doors is not None:
             break
-    return _Construction(seed, outline, cells, doors, rng).house()
+    return _Construction(seed, look, parts, doors, rng).house(goals_per_room)
 
 
 class _Construction:
     """The state while one house is built: surfaces, then furniture, then goals."""
 
-    def __init__(self, seed, outline: Rect, cells: list[Rect], doors: list[Door],
+    def __init__(self, seed, look, parts: list[list[Rect]], doors: list[Door],
                  rng: np.random.Generator):
-        self.seed, self.outline, self.cells, self.doors, self.rng = (
-            seed, outline, cells, doors, rng)
-        self.builder = SceneBuilder()
+        self.seed, self.look, self.doors, self.rng = seed, look, doors, rng
+        self.cells = [cell for part in parts for cell in part]
+        self.outline = bounds(self.cells)
+        self.builder = SceneBuilder(texture_library())
         self.instance = 0
-        self.obstacles = [Obstacle(rect, 'wall') for rect in wall_obstacles(outline, cells, doors)]
+        self.obstacles = [Obstacle(rect, 'wall') for rect in wall_obstacles(self.cells, doors)]
+        self.obstacles += [Obstacle(rect, 'outside') for rect in outside(
+            self.outline, [bounds(part) for part in parts])]
         self.rooms = self._name_rooms()
-        self.origin, self.shape = grid_of(outline)
+        self.origin, self.shape = grid_of(self.outline)
         self.clearance = clearance(self.origin, self.shape,
                                    np.array([o.rect for o in self.obstacles]))
 
-    def house(self) -> House:
+    def house(self, goals_per_room: int) -> House:
         """Run the construction."""
         for index in range(len(self.rooms)):
+            self.builder.room = index
             self._surfaces(index)
         for door in self.doors:
+            self.builder.room = door.first
             self._doorway(door)
         for index in range(len(self.rooms)):
+            self.builder.room = index
             self._furnish(index)
         for index in range(len(self.rooms)):
+            self.builder.room = index
             self._decorate(index)
-        scene = self.builder.build()
+        lamps = [((room.rect.x0 + room.rect.x1) / 2, (room.rect.y0 + room.rect.y1) / 2,
+                  HEIGHT - 0.35) for room in self.rooms]
+        scene = self.builder.build(light_baker(
+            np.array(lamps), np.array([self.outline.x0, self.outline.y0, 0.0]),
+            np.array([self.outline.x1, self.outline.y1, HEIGHT])))
         floor = floor_map(self.outline, np.array([o.rect for o in self.obstacles]),
                           FOOTPRINT_RADIUS)
-        goals = choose_goals(scene, self.rooms, floor, self.rng)
+        goals = choose_goals(scene, self.rooms, floor, self.rng, goals_per_room)
         return House(f'house-{self.seed}-{len(self.rooms)}', self.seed, self.outline, scene,
                      tuple(self.rooms), tuple(self.obstacles),
                      tuple(Goal(pose, room) for pose, room in goals), FOOTPRINT_RADIUS)
@@ -152,15 +169,17 @@ class _Construction:
         room = self.rooms[index]
         x0, y0, x1, y1 = room.rect
         wet = room.kind in ('kitchen', 'bathroom')
-        floor_texture = self.rng.choice(('tiles', 'checker', 'marble') if wet else FLOOR_TEXTURES)
-        floor_colour = self._colour(WHITES + WALL_COLOURS if wet else WOODS + FABRICS[3:4])
-        wall_texture = str(self.rng.choice(WALL_TEXTURES))
-        wall_colour = self._colour(WALL_COLOURS)
+        look = self.look
+        floor_texture = self.rng.choice(look.wet_floor_textures if wet
+                                        else look.dry_floor_textures)
+        floor_colour = self._colour(look.wet_floors if wet else look.woods + look.fabrics[3:4])
+        wall_texture = str(self.rng.choice(look.wall_textures))
+        wall_colour = self._colour(look.walls)
         instance = self._next_instance()
         self._add([(x0, y0, 0), (x1, y0, 0), (x1, y1, 0), (x0, y1, 0)], 'floor',
                   str(floor_texture), floor_colour, instance, tile=1.6)
         self._add([(x0, y1, HEIGHT), (x1, y1, HEIGHT), (x1, y0, HEIGHT), (x0, y0, HEIGHT)],
-                  'ceiling', 'plaster', self._colour(WHITES, 0.02), self._next_instance(),
+                  'ceiling', 'plaster', self._colour(look.whites, 0.02), self._next_instance(),
                   tile=1.5)
         self.builder.end_group()
         openings = self._openings(index)
@@ -187,7 +206,7 @@ class _Construction:
     def _doorway(self, door: Door) -> None:
         """Threshold, jambs and lintel of an opening."""
         half = WALL / 2
-        wood = self._colour(WOODS + WHITES)
+        wood = self._colour(self.look.woods + self.look.whites)
         instance = self._next_instance()
 
         def place(along, across, z):
@@ -209,42 +228,51 @@ class _Construction:
                 points = points[::-1]
             if door.axis == 1:
                 points = points[::-1]  # swapping the axes mirrors the winding
-            self._add(points, 'door', 'wood', wood, instance)
+            self._add(points, 'door', self.look.wood, wood, instance)
         self.builder.end_group()
 
     def _furnish(self, index: int) -> None:
-        room = self.rooms[index]
-        for name in ROOM_PROGRAMMES[room.kind]:
-            for _ in range(12):
-                if self._try_piece(index, name):
-                    break
+        """The room type's programme; then pieces of its optional part, some of the time."""
+        optional = False
+        for name in ROOM_PROGRAMMES[self.rooms[index].kind]:
+            if name is None:
+                optional = True
+            elif not optional or self.rng.random() < OPTIONAL_PROBABILITY:
+                for _ in range(12):
+                    if self._try_piece(index, name):
+                        break
 
     def _try_piece(self, index: int, name: str) -> bool:
-        """Put a piece at a random place along a random wall; False when it does not fit."""
+        """Put a piece at a random wall, or into the middle; False when it does not fit there."""
         room, kind = self.rooms[index], KINDS[name]
         width, depth, height = (self.rng.uniform(*span)
                                 for span in (kind.width, kind.depth, kind.height))
         quarter = int(self.rng.integers(4))
-        gap = 0.01
         # Quarter 0 stands at the south wall and faces north; each further one turns left.
         x0, y0, x1, y1 = room.rect
+        deep = depth + kind.standing
         length = (x1 - x0) if quarter % 2 == 0 else (y1 - y0)
-        if length < width + 2 * gap:
+        inwards = (y1 - y0) if quarter % 2 == 0 else (x1 - x0)
+        if length < width + 2 * GAP or inwards < deep + 2 * GAP:
             return False
-        along = self.rng.uniform(width / 2 + gap, length - width / 2 - gap)
-        if self.rng.random() < 0.5:  # furniture likes corners
-            along = width / 2 + gap if along < length / 2 else length - width / 2 - gap
+        if kind.centre:
+            along = length / 2 + self.rng.uniform(-0.2, 0.2) * (length - width)
+            gap = (inwards - deep) / 2 + self.rng.uniform(-0.15, 0.15) * (inwards - deep)
+        else:
+            gap = GAP
+            along = self.rng.uniform(width / 2 + gap, length - width / 2 - gap)
+            if self.rng.random() < 0.5:  # furniture likes corners
+                along = width / 2 + gap if along < length / 2 else length - width / 2 - gap
         origin = ((x0 + along, y0 + gap), (x1 - gap, y0 + along), (x1 - along, y1 - gap),
                   (x0 + gap, y1 - along))[quarter]
-        box = {0: Rect(origin[0] - width / 2, origin[1], origin[0] + width / 2, origin[1] + depth),
-               1: Rect(origin[0] - depth, origin[1] - width / 2, origin[0],
-                       origin[1] + width / 2),
-               2: Rect(origin[0] - width / 2, origin[1] - depth, origin[0] + width / 2, origin[1]),
-               3: Rect(origin[0], origin[1] - width / 2, origin[0] + depth,
-                       origin[1] + width / 2)}[quarter]
+        half = width / 2
+        box = (Rect(origin[0] - half, origin[1], origin[0] + half, origin[1] + deep),
+               Rect(origin[0] - deep, origin[1] - half, origin[0], origin[1] + half),
+               Rect(origin[0] - half, origin[1] - deep, origin[0] + half, origin[1]),
+               Rect(origin[0], origin[1] - half, origin[0] + deep, origin[1] + half))[quarter]
         if not self._fits(index, box):
             return False
-        piece = Piece(self.builder, origin, quarter, self._next_instance(), self.rng)
+        piece = Piece(self.builder, self.look, origin, quarter, self._next_instance(), self.rng)
         kind.draw(piece, width, depth, height)
         self.builder.end_group()
         self.obstacles.append(Obstacle(box, name))
@@ -261,7 +289,8 @@ class _Construction:
                     else Rect(door.at - DOOR_SPACE, low, door.at + DOOR_SPACE, high))
             if _overlap(box, zone, 0.0):
                 return False
-        if any(_overlap(box, o.rect, 0.05) for o in self.obstacles if o.label != 'wall'):
+        if any(_overlap(box, o.rect, 0.05) for o in self.obstacles
+               if o.label not in ('wall', 'outside')):
             return False
         narrowed = np.minimum(self.clearance,
                               clearance(self.origin, self.shape, np.array([box])))
@@ -278,16 +307,12 @@ class _Construction:
         room = self.rooms[index]
         x0, y0, x1, y1 = room.rect
         openings = self._openings(index)
-        tall = [o.rect for o in self.obstacles
-                if o.label in ('wardrobe', 'bookshelf', 'fridge', 'counter', 'washbasin')]
-        outer = {'south': y0 - WALL / 2 < self.outline.y0 + 1e-6,
-                 'north': y1 + WALL / 2 > self.outline.y1 - 1e-6,
-                 'west': x0 - WALL / 2 < self.outline.x0 + 1e-6,
-                 'east': x1 + WALL / 2 > self.outline.x1 - 1e-6}
+        tall = [o.rect for o in self.obstacles if o.label in TALL]
+        inner = self._inner_stretches(index)
         for wall in ('south', 'north', 'west', 'east'):
             horizontal = wall in ('south', 'north')
             low, high = (x0, x1) if horizontal else (y0, y1)
-            window = outer[wall] and self.rng.random() < 0.6
+            window = self.rng.random() < 0.6
             width = self.rng.uniform(1.0, 1.5) if window else self.rng.uniform(0.6, 1.1)
             height = self.rng.uniform(1.0, 1.2) if window else width * self.rng.uniform(0.7, 1.2)
             if high - low < width + 0.4:
@@ -296,6 +321,8 @@ class _Construction:
                 at = self.rng.uniform(low + width / 2 + 0.15, high - width / 2 - 0.15)
                 span = (at - width / 2, at + width / 2)
                 if any(span[0] < b + 0.1 and a - 0.1 < span[1] for a, b in openings[wall]):
+                    continue
+                if window and any(span[0] < b and a < span[1] for a, b in inner[wall]):
                     continue
                 line = {'south': y0, 'north': y1, 'west': x0, 'east': x1}[wall]
                 strip = (Rect(span[0], line - 0.3, span[1], line + 0.3) if horizontal
@@ -306,6 +333,25 @@ class _Construction:
                 break
         if room.kind in ('living_room', 'bedroom', 'office', 'dining_room', 'hall'):
             self._rug(room)
+        self.builder.end_group()
+        self._ceiling_lamp(room)
+
+    def _inner_stretches(self, index: int) -> dict[str, list[tuple[float, float]]]:
+        """Parts of a room's walls with another room behind them, by wall."""
+        found = {'south': [], 'north': [], 'west': [], 'east': []}
+        for contact in contacts(self.cells):
+            if index == contact.first:
+                found['north' if contact.axis == 0 else 'east'].append((contact.low, contact.high))
+            if index == contact.second:
+                found['south' if contact.axis == 0 else 'west'].append((contact.low, contact.high))
+        return found
+
+    def _ceiling_lamp(self, room: Room) -> None:
+        origin = ((room.rect.x0 + room.rect.x1) / 2, (room.rect.y0 + room.rect.y1) / 2)
+        piece = Piece(self.builder, self.look, origin, 0, self._next_instance(), self.rng)
+        piece.cylinder(0, 0, 0.015, HEIGHT - 0.25, HEIGHT, 'lamp', 'plain', piece.metal, sides=3,
+                       lid=False)
+        piece.shade(0, 0, 0.22, HEIGHT - 0.45, HEIGHT - 0.25)
         self.builder.end_group()
 
     def _hang(self, wall, line, span, centre, height, window) -> None:
@@ -318,9 +364,12 @@ class _Construction:
         else:
             points = [(line + inward, a, z0), (line + inward, b, z0), (line + inward, b, z1),
                       (line + inward, a, z1)]
-        texture = 'window' if window else f'painting_{int(self.rng.integers(PAINTINGS))}'
-        self._add(points, 'window' if window else 'picture', texture, np.full(3, 1.0),
-                  self._next_instance(), fit=True)
+        texture, label = str(self.rng.choice(self.look.paintings)), 'picture'
+        if window:
+            texture = label = 'window'
+        elif self.rng.random() < 0.08:
+            texture = label = 'clock'
+        self._add(points, label, texture, np.full(3, 1.0), self._next_instance(), fit=True)
 
     def _rug(self, room: Room) -> None:
         x0, y0, x1, y1 = room.rect
@@ -329,8 +378,9 @@ class _Construction:
         cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
         points = [(cx - width / 2, cy - depth / 2, 0.008), (cx + width / 2, cy - depth / 2, 0.008),
                   (cx + width / 2, cy + depth / 2, 0.008), (cx - width / 2, cy + depth / 2, 0.008)]
-        texture = str(self.rng.choice(('dots', 'stripes', 'fabric', 'checker')))
-        self._add(points, 'rug', texture, self._colour(FABRICS), self._next_instance(), tile=0.8)
+        texture = str(self.rng.choice(self.look.rug_textures))
+        self._add(points, 'rug', texture, self._colour(self.look.fabrics),
+                  self._next_instance(), tile=0.8)
 
 
 def _overlap(a: Rect, b: Rect, gap: float) -> bool:

@@ -1,7 +1,6 @@
 """The texture library: small tiling pictures drawn by formula, the same for every house.
 
-Houses vary by which textures they use and by the colours that multiply them. Each texture is kept
-as a chain of halved pictures (mip-map), so that distant surfaces do not shimmer.
+Houses vary by which textures they use and by the colours that multiply them.
 """
 
 from __future__ import annotations
@@ -11,10 +10,11 @@ import functools
 import cv2
 import numpy as np
 
-from vn_sim_bridge.scene import MIP_LEVELS, TEXTURE_SIZE
+from vn_sim_bridge.scene import TextureSet
 
-_SIZE = TEXTURE_SIZE
+_SIZE = 64  # texels a side
 PAINTINGS = 32  # distinct pictures for walls
+UNSEEN_PAINTINGS = 12  # more of them, for the unseen look
 
 
 def _noise(rng: np.random.Generator, cells: int) -> np.ndarray:
@@ -141,30 +141,209 @@ def _painting(rng) -> np.ndarray:
     return picture
 
 
+def _parquet(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    across = ((x // 16) + (y // 16)) % 2 == 0
+    along = np.where(across, x, y)
+    joint = (along % 4 == 0) | (x % 16 == 0) | (y % 16 == 0)
+    tone = rng.uniform(0.76, 1.0, (4, 4))[y // 16, x // 16]
+    return _grey(np.where(joint, 0.74, 1.0) * tone * (0.94 + 0.06 * _noise(rng, 16)))
+
+
+def _carpet(rng) -> np.ndarray:
+    return _grey(0.80 + 0.14 * rng.random((_SIZE, _SIZE)) + 0.06 * _noise(rng, 8))
+
+
+def _weave(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    return _grey(0.80 + 0.10 * ((x // 4 + y // 4) % 2) + 0.06 * (x % 4 < 2) + 0.04 * rng.random(
+        (_SIZE, _SIZE)))
+
+
+def _leafy(rng) -> np.ndarray:
+    picture = np.full((_SIZE, _SIZE), 1.0)
+    for _ in range(26):
+        centre = rng.integers(0, _SIZE, 2)
+        axes, angle = (int(rng.integers(3, 6)), 2), int(rng.integers(180))
+        for dx in (-_SIZE, 0, _SIZE):
+            for dy in (-_SIZE, 0, _SIZE):
+                cv2.ellipse(picture, (int(centre[0]) + dx, int(centre[1]) + dy), axes, angle, 0,
+                            360, float(rng.uniform(0.66, 0.86)), -1)
+    return _grey(picture * (0.97 + 0.03 * _noise(rng, 16)))
+
+
+def _medallion(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE] - 31.5
+    ring = (np.hypot(x, y) // 6) % 2
+    rim = np.maximum(abs(x), abs(y)) > 27
+    return _grey(np.where(rim, 0.6, np.where(ring > 0, 0.72, 1.0)))
+
+
+def _drawers(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    picture = np.where((y % 21 < 2) | (x < 2) | (x > 61), 0.62, 1.0)
+    picture[(abs((y % 21) - 11) < 2) & (abs(x - 32) < 7)] = 0.35
+    return _grey(picture)
+
+
+def _twin(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    picture = np.where((abs(x - 32) < 1) | (x < 2) | (x > 61) | (y < 2) | (y > 61), 0.55, 1.0)
+    picture[(abs(abs(x - 32) - 5) < 2) & (abs(y - 32) < 7)] = 0.3
+    return _grey(picture)
+
+
+def _fire(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    height = 24 + 20 * np.sin(x / 6.0) * np.sin(x / 2.7 + 1)
+    glow = np.clip((y - (_SIZE - height)) / 30, 0, 1)
+    return np.stack([0.1 + 0.9 * glow, 0.05 + 0.5 * glow**2, 0.04 + 0.1 * glow**3], axis=2)
+
+
+def _water(rng) -> np.ndarray:
+    picture = np.ones((_SIZE, _SIZE, 3)) * (0.25, 0.55, 0.75)
+    picture *= (0.8 + 0.3 * _noise(rng, 8))[:, :, None]
+    for _ in range(9):
+        centre = tuple(int(v) for v in rng.integers(8, 56, 2))
+        cv2.ellipse(picture, centre, (5, 3), 0, 0, 360,
+                    tuple(float(c) for c in rng.uniform(0.3, 1.0, 3)), -1)
+    picture[56:] = (0.75, 0.65, 0.45)
+    return np.clip(picture, 0, 1)
+
+
+def _clock(rng) -> np.ndarray:
+    picture = np.full((_SIZE, _SIZE, 3), 0.95)
+    cv2.circle(picture, (32, 32), 30, (0.15, 0.15, 0.17), 4)
+    cv2.line(picture, (32, 32), (32, 12), (0.1, 0.1, 0.1), 3)
+    cv2.line(picture, (32, 32), (46, 38), (0.7, 0.1, 0.1), 3)
+    return picture
+
+
+def _keys(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    black = (x % 8 < 4) & ((x // 8) % 7 != 2) & ((x // 8) % 7 != 6) & (y < 38)
+    return _grey(np.where(black, 0.08, np.where(x % 8 == 5, 0.6, 0.97)))
+
+
+# Materials of the unseen look.
+
+def _herringbone(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    diagonal = np.where((x // 16) % 2 == 0, x + y, y - x) % 16
+    tone = 0.78 + 0.22 * (((np.where((x // 16) % 2 == 0, x + y, y - x)) // 16) % 4) / 3
+    return _grey(np.where((diagonal < 1) | (x % 16 == 0), 0.55, tone))
+
+
+def _cork(rng) -> np.ndarray:
+    return _grey(np.where(rng.random((_SIZE, _SIZE)) < 0.16, 0.62, 0.95)
+                 * (0.88 + 0.12 * _noise(rng, 16)))
+
+
+def _diamonds(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    inside = (abs(x % 32 - 16) + abs(y % 32 - 16)) < 14
+    return _grey(np.where(inside, 0.68, 1.0) * (0.95 + 0.05 * _noise(rng, 16)))
+
+
+def _hexagons(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE].astype(float)
+    nearest = np.full((2, _SIZE, _SIZE), 1e9)
+    for i in range(-1, 6):
+        for j in range(-1, 6):
+            d = np.hypot(x - (16 * i + 8 * (j % 2)), y - 64 / 4 * j)
+            nearest = np.sort(np.concatenate([nearest, d[None]]), axis=0)[:2]
+    return _grey(np.where(nearest[1] - nearest[0] < 1.6, 0.6, 0.96))
+
+
+def _terrazzo(rng) -> np.ndarray:
+    picture = np.ones((_SIZE, _SIZE, 3)) * 0.9
+    for _ in range(110):
+        centre = tuple(int(v) for v in rng.integers(0, _SIZE, 2))
+        cv2.circle(picture, centre, int(rng.integers(1, 4)),
+                   tuple(float(c) for c in rng.uniform(0.35, 1.0, 3)), -1)
+    return picture
+
+
+def _concrete(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    joint = (x % 64 == 0) | (y % 32 == 0)
+    return _grey(np.where(joint, 0.7, 0.78 + 0.22 * _noise(rng, 8)))
+
+
+def _damask(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE] * (2 * np.pi / 32)
+    return _grey(np.where(np.sin(x) * np.cos(y) + 0.6 * np.cos(2 * x + np.sin(y)) > 0.15, 0.74,
+                          1.0))
+
+
+def _bands(rng) -> np.ndarray:
+    y = np.arange(_SIZE) % 32
+    return _grey(np.repeat(np.where(y < 11, 0.72, np.where(y < 14, 0.5, 1.0))[:, None], _SIZE, 1))
+
+
+def _panels(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    edge = (abs(abs((x % 32) - 16) - 11) < 1) | (abs(abs((y % 64) - 32) - 26) < 1)
+    return _grey(np.where(edge, 0.66, 0.97))
+
+
+def _plaid(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    return _grey(0.62 + 0.19 * (x % 16 < 9) + 0.19 * (y % 16 < 9))
+
+
+def _corduroy(rng) -> np.ndarray:
+    x = np.arange(_SIZE) % 4
+    return _grey(np.repeat((0.72 + 0.09 * x)[None, :], _SIZE, 0))
+
+
+def _rings(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE] % 32 - 15.5
+    return _grey(np.where((np.hypot(x, y) // 4) % 2 > 0, 0.66, 1.0))
+
+
+def _knotty(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    grain = 0.86 + 0.10 * np.sin(y * 2 * np.pi / 8 + 4 * _noise(rng, 4))
+    for _ in range(5):
+        cx, cy = rng.integers(8, 56, 2)
+        grain = np.where(np.hypot(x - cx, 2 * (y - cy)) < 4, 0.45, grain)
+    return _grey(grain)
+
+
+def _louvre(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    return _grey(np.where((x < 5) | (x > 58) | (y < 4) | (y > 59), 1.0, 0.6 + 0.09 * (y % 5)))
+
+
+def _grooves(rng) -> np.ndarray:
+    y, x = np.mgrid[:_SIZE, :_SIZE]
+    picture = np.where(x % 10 < 2, 0.6, 1.0)
+    picture[(y > 28) & (y < 36) & (x > 52)] = 0.25
+    return _grey(picture)
+
+
 _RECIPES = {
     'plain': _plain, 'plaster': _plaster, 'stripes': _stripes, 'dots': _dots, 'brick': _brick,
     'planks': _planks, 'tiles': lambda rng: _tiles(rng, False),
     'checker': lambda rng: _tiles(rng, True), 'fabric': _fabric, 'wood': _wood,
     'marble': _marble, 'books': _books, 'window': _window, 'door': _doorleaf, 'leaves': _leaves,
-} | {f'painting_{i}': _painting for i in range(PAINTINGS)}
+    'parquet': _parquet, 'carpet': _carpet, 'weave': _weave, 'leafy': _leafy,
+    'medallion': _medallion, 'drawers': _drawers, 'twin': _twin, 'fire': _fire, 'water': _water,
+    'clock': _clock, 'keys': _keys,
+    'herringbone': _herringbone, 'cork': _cork, 'diamonds': _diamonds, 'hexagons': _hexagons,
+    'terrazzo': _terrazzo, 'concrete': _concrete, 'damask': _damask, 'bands': _bands,
+    'panels': _panels, 'plaid': _plaid, 'corduroy': _corduroy, 'rings': _rings,
+    'knotty': _knotty, 'louvre': _louvre, 'grooves': _grooves,
+} | {f'painting_{i}': _painting for i in range(PAINTINGS + UNSEEN_PAINTINGS)}
 
 TEXTURES = {name: index for index, name in enumerate(_RECIPES)}
 
 
 @functools.cache
-def texture_library() -> np.ndarray:
-    """All textures with their mip chains.
-
-    Returns:
-        [n_textures, texels, 3] uint8; a chain is 64 x 64, 32 x 32, ... one after another.
-    """
-    chains = []
-    for index, recipe in enumerate(_RECIPES.values()):
-        picture = recipe(np.random.default_rng(1000 + index)).astype(np.float32)
-        levels = []
-        for level in range(MIP_LEVELS):
-            side = _SIZE >> level
-            small = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
-            levels.append(np.clip(small * 255, 0, 255).round().astype(np.uint8).reshape(-1, 3))
-        chains.append(np.concatenate(levels))
-    return np.stack(chains)
+def texture_library() -> TextureSet:
+    """All textures, one object for every house."""
+    pictures = [recipe(np.random.default_rng(1000 + index))
+                for index, recipe in enumerate(_RECIPES.values())]
+    return TextureSet([np.clip(picture * 255, 0, 255).round().astype(np.uint8)
+                       for picture in pictures])

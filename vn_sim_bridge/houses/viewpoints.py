@@ -16,8 +16,9 @@ CANDIDATES = 24  # views looked at in each room
 WALL_DISTANCE = 0.45  # m that a goal keeps from the walls of its room
 
 
-def choose_goals(scene: Scene, rooms: list[Room], floor: FloorMap, rng: np.random.Generator):
-    """The best of some random views in every room, as (pose, room name).
+def choose_goals(scene: Scene, rooms: list[Room], floor: FloorMap, rng: np.random.Generator,
+                 per_room: int = 1):
+    """The best of some random views in every room, as (pose, room name), `per_room` of each.
 
     A view is good when it shows many different things at a few metres' distance: nobody
     photographs a blank wall to say where to go.
@@ -25,7 +26,7 @@ def choose_goals(scene: Scene, rooms: list[Room], floor: FloorMap, rng: np.rando
     renderer = Rasterizer([scene], 32)
     centres = floor.centres()
     goals = []
-    for room in rooms:
+    for room in (room for room in rooms for _ in range(per_room)):
         x0, y0, x1, y1 = room.rect
         inside = centres[(centres[:, 0] > x0 + WALL_DISTANCE)
                          & (centres[:, 0] < x1 - WALL_DISTANCE)
