@@ -48,6 +48,8 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument('--collision-reward', type=float, default=-0.02, help='per contact')
     train.add_argument('--learning-rate', type=float, default=4e-4)
     train.add_argument('--entropy', type=float, default=0.008, help='weight of the entropy')
+    train.add_argument('--curriculum', choices=('success', 'frames'), default='success',
+                       help='what raises the difficulty')
     train.add_argument('--rollout-length', type=int, default=32)
     train.add_argument('--epochs', type=int, default=2)
     train.add_argument('--minibatches', type=int, default=4)
@@ -126,7 +128,8 @@ def run_train(args) -> int:
                    progress_reward=args.progress_reward, collision_reward=args.collision_reward)
     config = TrainConfig(
         frames=int(args.frames), minutes=args.minutes, rollout_length=args.rollout_length,
-        epochs=args.epochs, minibatches=args.minibatches, channels=tuple(args.channels),
+        curriculum=args.curriculum, epochs=args.epochs, minibatches=args.minibatches,
+        channels=tuple(args.channels),
         learning_rate=args.learning_rate, final_learning_rate=args.learning_rate / 10,
         entropy_coefficient=args.entropy, final_entropy_coefficient=args.entropy / 3,
         seed=args.seed, bf16=False if args.no_bf16 else None, threads=args.threads,

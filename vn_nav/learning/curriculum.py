@@ -1,4 +1,4 @@
-"""The success-driven curriculum on start distance."""
+"""Curricula on start distance: driven by success, or by frames as in the thesis."""
 
 from __future__ import annotations
 
@@ -70,3 +70,33 @@ class Curriculum:
         self.successes.extend(state['successes'])
         self._first = np.array(state['first'], np.int64)
         self._finished = np.array(state['finished'], bool)
+
+
+class FrameCurriculum:
+    """Raises the difficulty tau with the frames, whatever the policy can do (thesis, 4.5).
+
+    The thesis keeps 0.3 until 5e6 of its 4e7 frames and reaches 1.0 at 1e7; the marks scale with
+    the length of the training.
+
+    Args:
+        start: first tau.
+        begin, end: shares of the training between which tau grows linearly to 1.
+    """
+
+    def __init__(self, *, start: float = 0.3, begin: float = 0.125, end: float = 0.25):
+        self.start, self.begin, self.end = start, begin, end
+        self.tau = start
+
+    def advance(self, progress: float) -> bool:
+        """Set tau for a share of the training that is over; True when it changed."""
+        share = min(max((progress - self.begin) / (self.end - self.begin), 0.0), 1.0)
+        before, self.tau = self.tau, self.start + (1.0 - self.start) * share
+        return self.tau != before
+
+    def state_dict(self) -> dict:
+        """Plain values."""
+        return {'tau': self.tau}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on where `state_dict` was taken."""
+        self.tau = state['tau']

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from vn_nav.errors import UserError
-from vn_nav.learning.curriculum import Curriculum
+from vn_nav.learning.curriculum import Curriculum, FrameCurriculum
 from vn_nav.learning.learner import Learner, LearnerConfig
 from vn_nav.learning.rollout import Collector, Episode
 from vn_nav.policy.checkpoint import save_checkpoint, write_file
@@ -43,6 +43,7 @@ class TrainConfig(LearnerConfig):
     channels: tuple[int, int, int] = (32, 64, 32)
     features: int = 256
     hidden: int = 256
+    curriculum: str = 'success'  # or 'frames': what raises the difficulty
     start_difficulty: float = 0.3  # tau of the curriculum; 1 switches it off
     success_to_advance: float = 0.75
     difficulty_step: float = 0.1
@@ -60,6 +61,8 @@ class TrainConfig(LearnerConfig):
             (self.minutes is None or self.minutes > 0, 'a wall-clock limit is positive',
              self.minutes),
             (self.rollout_length >= 2, 'rollout_length is at least 2', self.rollout_length),
+            (self.curriculum in ('success', 'frames'), 'the curriculum is success or frames',
+             self.curriculum),
             (0 < self.start_difficulty <= 1, 'start_difficulty lies in (0, 1]',
              self.start_difficulty),
             (self.difficulty_step > 0, 'difficulty_step is positive', self.difficulty_step),
@@ -146,9 +149,12 @@ class _Training:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.learner = Learner(self.network, config, self.generator)
         self.collector = Collector(env, self.network, self.generator)
-        self.curriculum = Curriculum(
-            env.num_envs, start=config.start_difficulty, threshold=config.success_to_advance,
-            step=config.difficulty_step, window=config.advance_window)
+        if config.curriculum == 'frames':
+            self.curriculum = FrameCurriculum(start=config.start_difficulty)
+        else:
+            self.curriculum = Curriculum(
+                env.num_envs, start=config.start_difficulty, threshold=config.success_to_advance,
+                step=config.difficulty_step, window=config.advance_window)
         self.recent: deque[Episode] = deque(maxlen=RECENT)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
         self.clock = time.monotonic()
@@ -180,7 +186,8 @@ class _Training:
         self.clock = end
         self.recent.extend(episodes)
         tau = self.curriculum.tau
-        if self.curriculum.update(episodes, self.collector.number):
+        if (self.curriculum.advance(self.progress) if self.config.curriculum == 'frames'
+                else self.curriculum.update(episodes, self.collector.number)):
             self.env.set_difficulty(self.curriculum.tau)
         decisions = max(sum(episode.decisions for episode in self.recent), 1)
         return dict(zip(COLUMNS, (

@@ -24,6 +24,7 @@ from vn_nav.errors import UserError
 from vn_sim_bridge.scene import MAX_CORNERS, MAX_LIGHT_NODES, Scene
 
 NEAR = 0.03  # m, near plane
+CLUSTER = 16  # groups whose common box is tested first
 TILE = 8  # pixels a side, of the coarse depth that hides groups
 BLOCK = 16  # pixels of a row between which light is linear
 BINS = 32  # of the front-to-back order
@@ -70,6 +71,8 @@ class Pack(NamedTuple):
     group_start: np.ndarray
     group_box: np.ndarray
     scene_group: np.ndarray  # [scenes+1] int64 into groups
+    cluster_box: np.ndarray  # [C,6] float32, around `CLUSTER` groups
+    scene_cluster: np.ndarray  # [scenes+1] int64 into clusters
     texels: np.ndarray
 
 
@@ -192,7 +195,15 @@ def pack_scenes(scenes: Sequence[Scene]) -> Pack:
         group_box=join((s.group_box for s in scenes), np.float32),
         scene_group=group_base.astype(np.int64),
         texels=join((t.texels for t in sets), np.uint32),
+        cluster_box=join((_clusters(s.group_box) for s in scenes), np.float32),
+        scene_cluster=np.cumsum([0] + [-(-len(s.group_room) // CLUSTER) for s in scenes]),
     )
+
+
+def _clusters(boxes: np.ndarray) -> np.ndarray:
+    first = np.arange(0, len(boxes), CLUSTER)
+    return np.concatenate([np.minimum.reduceat(boxes[:, :3], first),
+                           np.maximum.reduceat(boxes[:, 3:], first)], axis=1)
 
 
 # No reassociation and no fused multiply-add: Warp's kernels must find the same pixels.
@@ -270,7 +281,7 @@ def _hidden(box, frame, focal, size, tiles):
 
 @_exact
 def _update_tiles(inverse_depth, tiles):
-    """The farthest drawn depth of each tile (0 while a pixel is empty)."""
+    """The least inverse depth of each tile (0 while a pixel is empty); returns that of all."""
     size = inverse_depth.shape[0]
     tiles[:] = np.float32(1e30)
     whole = size // TILE
@@ -283,6 +294,11 @@ def _update_tiles(inverse_depth, tiles):
             tiles[i, j] = min(tiles[i, j], least)
         for column in range(whole * TILE, size):
             tiles[i, whole] = min(tiles[i, whole], inverse_depth[row, column])
+    farthest = np.float32(1e30)
+    for i in range(tiles.shape[0]):
+        for j in range(tiles.shape[1]):
+            farthest = min(farthest, tiles[i, j])
+    return farthest
 
 
 @_exact
@@ -394,36 +410,44 @@ def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, left, ri
 def _see(pack, scene, frames, objects, focal, size, most_faces, work, inverse_depth,
          ident_of_pixel):
     """Fill the visibility buffer of one camera."""
-    near, order, bin_start, tiles, polygon, clipped, left, right = work
+    near, seen, order, bin_start, tiles, polygon, clipped, left, right = work
     frame = frames[0]
     slope = size * 0.5 / focal
     first, last = pack.scene_group[scene], pack.scene_group[scene + 1]
     bin_start[:] = 0
-    for group in range(first, last):
-        depth = _nearest_depth(pack.group_box[group], frame, slope)
-        near[group - first] = depth
-        if depth >= 0.0:
-            bin_start[min(int(depth / BIN_DEPTH), BINS - 1) + 1] += 1
+    found = 0
+    for cluster in range(pack.scene_cluster[scene], pack.scene_cluster[scene + 1]):
+        if _nearest_depth(pack.cluster_box[cluster], frame, slope) < 0.0:
+            continue
+        begin = first + (cluster - pack.scene_cluster[scene]) * CLUSTER
+        for group in range(begin, min(begin + CLUSTER, last)):
+            depth = _nearest_depth(pack.group_box[group], frame, slope)
+            if depth >= 0.0:
+                near[found] = depth
+                seen[found] = group
+                found += 1
+                bin_start[min(int(depth / BIN_DEPTH), BINS - 1) + 1] += 1
     for k in range(BINS):
         bin_start[k + 1] += bin_start[k]
-    total = bin_start[BINS]
-    for group in range(first, last):
-        depth = near[group - first]
-        if depth >= 0.0:
-            k = min(int(depth / BIN_DEPTH), BINS - 1)
-            order[bin_start[k]] = group
-            bin_start[k] += 1
+    for k in range(found):
+        place = min(int(near[k] / BIN_DEPTH), BINS - 1)
+        order[bin_start[place]] = k
+        bin_start[place] += 1
     base = pack.group_start[first]
     fresh = 0
     known = False
-    for k in range(total):
-        group = order[k]
-        depth = near[group - first]
+    horizon = 1e30  # m: everything that can be seen is nearer
+    for k in range(found):
+        group, depth = seen[order[k]], near[order[k]]
         if depth > 1.0:
             if fresh >= 12 or (not known and fresh > 0):
-                _update_tiles(inverse_depth, tiles)
+                farthest = _update_tiles(inverse_depth, tiles)
+                if farthest > np.float32(0.0):
+                    horizon = 1.0 / farthest
                 fresh = 0
                 known = True
+            if depth > horizon:
+                continue
             if known and _hidden(pack.group_box[group], frame, focal, size, tiles):
                 continue
         for face in range(pack.group_start[group], pack.group_start[group + 1]):
@@ -636,6 +660,7 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
 def _workspace(size, most_groups):
     tiles = (size + TILE - 1) // TILE
     return (np.empty(most_groups), np.empty(most_groups, np.int64),
+            np.empty(most_groups, np.int64),
             np.empty(BINS + 1, np.int64), np.empty((tiles, tiles), np.float32),
             np.empty((MAX_CORNERS + 2, 3), np.float32), np.empty((MAX_CORNERS + 2, 3), np.float32),
             np.empty(size, np.float32), np.empty(size, np.float32))
