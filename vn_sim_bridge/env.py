@@ -247,6 +247,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if reset.any():
             self._begin(np.nonzero(reset)[0])
         self._measure(acting)
+        self._step[acting] += 1
         frames = self._look()
         objects = self.backend.objects
         verdict = self.task.judge(tasks.Situation(
@@ -258,7 +259,6 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             collision=self.config.collision_reward)).astype(np.float32)
         self._last_action[acting] = actions[acting]
         self._last_reward[acting] = verdict.reward[acting]
-        self._step[acting] += 1
         terminated = verdict.success
         truncated = ~terminated & ~reset & (self._step >= self.config.max_decisions)
         self._done = terminated | truncated
