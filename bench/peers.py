@@ -61,8 +61,8 @@ def envpool_step():
     return lambda: env.step(actions[next(turn) % 64])
 
 
-def miniworld_step():
-    """One frame of FourRooms at 84 x 84: RGB."""
+def miniworld_step(depth: bool):
+    """One frame of FourRooms at 84 x 84: RGB, and depth if asked for."""
     os.environ.setdefault('PYGLET_HEADLESS', '1')
     import pyglet
     pyglet.options['headless'] = True
@@ -76,6 +76,8 @@ def miniworld_step():
         _, _, terminated, truncated, _ = env.step(int(rng.integers(0, 3)))
         if terminated or truncated:
             env.reset()
+        if depth:
+            env.unwrapped.render_depth(env.unwrapped.obs_fb)
     return step
 
 
@@ -141,7 +143,9 @@ def main():
     scene = parser.parse_args().scene
     answers = os.fdopen(os.dup(1), 'w')
     os.dup2(2, 1)  # what the peers print goes elsewhere
-    makers = {'ViZDoom': vizdoom_step, 'EnvPool': envpool_step, 'MiniWorld': miniworld_step,
+    makers = {'ViZDoom': vizdoom_step, 'EnvPool': envpool_step,
+              'MiniWorld': lambda: miniworld_step(True),
+              'MiniWorld, RGB alone': lambda: miniworld_step(False),
               'MuJoCo': lambda: mujoco_step(scene)}
     steps, missing = {}, {}
     for name, make in makers.items():

@@ -29,7 +29,10 @@ TILE = 8  # pixels a side, of the coarse depth that hides groups
 BLOCK = 16  # pixels of a row between which light is linear
 BINS = 32  # of the front-to-back order
 BIN_DEPTH = 0.5  # m
+MAX_SIZE = 2048  # pixels a side of a picture
 EMPTY = np.int32(2**31 - 1)
+# Two parts of one buffer, a constant distance apart: the compiler sees that they do not overlap.
+RIGHT = np.uint64(MAX_SIZE)
 LAST_NODE = (MAX_LIGHT_NODES - 1) * 16
 
 # Light by the direction that a surface faces: +x, -x, +y, -y, up, down. Six different values let a
@@ -99,6 +102,8 @@ class Rasterizer:
     """
 
     def __init__(self, scenes: Sequence[Scene], size: int, *, threads: int = 1):
+        if not 1 <= size <= MAX_SIZE:
+            raise UserError(f'pictures have 1 to {MAX_SIZE} pixels a side', size, 'choose fewer')
         self.size = size
         self.threads = threads
         self.pack = pack_scenes(scenes)
@@ -302,8 +307,8 @@ def _update_tiles(inverse_depth, tiles):
 
 
 @_exact
-def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, left, right,
-               inverse_depth, ident_of_pixel):
+def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, spans, inverse_depth,
+               ident_of_pixel):
     """Scan-convert one polygon into the visibility buffer; 1 if it may have covered a pixel."""
     px, py, pz = frame[0], frame[1], frame[2]
     fx, fy, fz = frame[3], frame[4], frame[5]
@@ -367,9 +372,9 @@ def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, left, ri
     last_row = np.int32(min(high_y, limit) + np.float32(0.5))
     if first_row >= last_row:
         return 0
-    for row in range(first_row, last_row):
-        left[row] = limit
-        right[row] = np.float32(0.0)
+    for row in range(np.uint64(first_row), np.uint64(last_row)):
+        spans[row] = limit
+        spans[row + RIGHT] = np.float32(0.0)
     for i in range(count):
         j = i + 1 if i + 1 < count else 0
         x0, y0, x1, y1 = points[i, 0], points[i, 1], points[j, 0], points[j, 1]
@@ -384,8 +389,8 @@ def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, left, ri
         y0 -= np.float32(0.5)  # of a row's centre; kept apart from x0, which it may dwarf
         for row in range(np.uint64(start), np.uint64(stop)):
             x = x0 + (np.float32(np.int32(row)) - y0) * gradient
-            left[row] = min(left[row], x)
-            right[row] = max(right[row], x)
+            spans[row] = min(spans[row], x)
+            spans[row + RIGHT] = max(spans[row + RIGHT], x)
     # 1 / depth is affine in the pixel: n . direction / -height.
     across = (nx * rx + ny * ry + nz * rz) / (-height * focal)
     along = (nx * dx + ny * dy + nz * dz) / (-height * focal)
@@ -393,8 +398,8 @@ def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, left, ri
             + (0.5 - half) * along)
     slope_x = np.float32(across)
     for row in range(np.uint64(first_row), np.uint64(last_row)):
-        begin = np.int32(max(left[row], np.float32(0.0)) + np.float32(0.5))
-        end = np.int32(min(right[row], limit) + np.float32(0.5))
+        begin = np.int32(max(spans[row], np.float32(0.0)) + np.float32(0.5))
+        end = np.int32(min(spans[row + RIGHT], limit) + np.float32(0.5))
         row_value = np.float32(base + np.int32(row) * along)
         inverses, idents = inverse_depth[row], ident_of_pixel[row]
         for column in range(np.uint64(begin), np.uint64(max(begin, end))):
@@ -410,7 +415,7 @@ def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, left, ri
 def _see(pack, scene, frames, objects, focal, size, most_faces, work, inverse_depth,
          ident_of_pixel):
     """Fill the visibility buffer of one camera."""
-    near, seen, order, bin_start, tiles, polygon, clipped, left, right = work
+    near, seen, order, bin_start, tiles, polygon, clipped, spans = work
     frame = frames[0]
     slope = size * 0.5 / focal
     first, last = pack.scene_group[scene], pack.scene_group[scene + 1]
@@ -452,7 +457,7 @@ def _see(pack, scene, frames, objects, focal, size, most_faces, work, inverse_de
                 continue
         for face in range(pack.group_start[group], pack.group_start[group + 1]):
             _draw_face(pack, face, np.int32(face - base), frame, focal, size, polygon, clipped,
-                       left, right, inverse_depth, ident_of_pixel)
+                       spans, inverse_depth, ident_of_pixel)
         fresh += 1
     for m in range(objects.shape[0]):
         if objects[m] < 0:
@@ -464,8 +469,8 @@ def _see(pack, scene, frames, objects, focal, size, most_faces, work, inverse_de
             for face in range(pack.group_start[group], pack.group_start[group + 1]):
                 _draw_face(pack, face,
                            np.int32((m + 1) * most_faces + face - pack.group_start[first]),
-                           frames[m + 1], focal, size, polygon, clipped, left, right,
-                           inverse_depth, ident_of_pixel)
+                           frames[m + 1], focal, size, polygon, clipped, spans, inverse_depth,
+                           ident_of_pixel)
 
 
 _shading = numba.njit(cache=True, fastmath=True, error_model='numpy')
@@ -539,22 +544,21 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
     """
     size = depth.shape[0]
     half = size * 0.5
-    slots, slot_of, stamp_of, stamp = work
+    slots, slot_of, code_of, stamp_of, stamp, codes = work
     used = 0
+    nothing = np.int32(len(code_of) - 1)  # the entry of pixels that show none
+    code_of[nothing] = 0
     first_face = pack.group_start[pack.scene_group[scene]]
     for row in range(size):
         idents = ident_of_pixel[row]
+        inverses, depths = inverse_depth[row], depth[row]
         reds, greens, blues = rgb[0, row], rgb[1, row], rgb[2, row]
-        depths, classes, things = depth[row], labels[row], instances[row]
-        inverses = inverse_depth[row]
-        for column in range(size):
+        for column in range(np.uint64(size)):
             depths[column] = np.float32(1.0) / max(inverses[column], np.float32(1e-9))
         begin = 0
         known = EMPTY
         s = slots[0]
         face = 0
-        which = 0
-        instance = np.uint16(0)
         lit = False
         red = green = blue = next_red = next_green = next_blue = np.int32(0)
         while begin < size:
@@ -569,27 +573,25 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
                     greens[column] = 0
                     blues[column] = 0
                     depths[column] = 0.0
-                    classes[column] = 0
-                    things[column] = 0
                 begin = end
                 continue
             if ident != known:
                 known = ident
+                which = 0
                 if ident < most_faces:
-                    which = 0
                     face = first_face + ident
-                    instance = pack.face_instance[face]
                 else:
                     which = ident // most_faces
                     face = (pack.group_start[pack.scene_group[objects[which - 1]]]
                             + ident - which * most_faces)
-                    instance = np.uint16(65536 - which)
                 if stamp_of[ident] != stamp:
                     stamp_of[ident] = stamp
                     slot_of[ident] = used
                     room = pack.face_room[face] if which == 0 else object_room[which - 1]
                     _prepare(pack, face, frames[which], focal, half, cube, lamps[room],
                              slots[used])
+                    thing = np.int32(pack.face_instance[face]) if which == 0 else 65536 - which
+                    code_of[ident] = thing << 8 | np.int32(pack.face_label[face])
                     used += 1
                 s = slots[np.uint64(slot_of[ident])]
             u_offset, v_offset = s[3], s[7]
@@ -634,7 +636,6 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
             u_offset, v_offset, u_row, v_row = (u_offset * wide, v_offset * wide, u_row * wide,
                                                 v_row * wide)
             u_right, v_right = s[0] * wide, s[4] * wide
-            label = pack.face_label[face]
             x = np.float32(begin)
             for column in range(np.uint64(begin), np.uint64(end)):
                 z = depths[column]
@@ -645,8 +646,6 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
                 reds[column] = np.uint8(((texel & 255) * red + 32768) >> 16)
                 greens[column] = np.uint8((((texel >> 8) & 255) * green + 32768) >> 16)
                 blues[column] = np.uint8(((texel >> 16) * blue + 32768) >> 16)
-                classes[column] = label
-                things[column] = instance
                 red += red_step
                 green += green_step
                 blue += blue_step
@@ -654,6 +653,13 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
             if lit:
                 red, green, blue = next_red, next_green, next_blue
             begin = end
+        label_row, instance_row = labels[row], instances[row]
+        for column in range(np.uint64(size)):
+            codes[column] = code_of[np.uint64(min(idents[column], nothing))]
+        for column in range(np.uint64(size)):
+            label_row[column] = np.uint8(codes[column] & 255)
+        for column in range(np.uint64(size)):
+            instance_row[column] = np.uint16(codes[column] >> 8)
 
 
 @_exact
@@ -663,7 +669,7 @@ def _workspace(size, most_groups):
             np.empty(most_groups, np.int64),
             np.empty(BINS + 1, np.int64), np.empty((tiles, tiles), np.float32),
             np.empty((MAX_CORNERS + 2, 3), np.float32), np.empty((MAX_CORNERS + 2, 3), np.float32),
-            np.empty(size, np.float32), np.empty(size, np.float32))
+            np.empty(2 * MAX_SIZE, np.float32))
 
 
 @_exact
@@ -678,7 +684,9 @@ def _render_range(begin, end, pack, scene_index, cameras, focal, lights, objects
     work = _workspace(size, most_groups)
     slots = np.empty((min(idents, size * size), 16), np.float32)
     slot_of = np.empty(idents, np.int32)
+    code_of = np.empty(idents + 1, np.int32)
     stamp_of = np.zeros(idents, np.int32)
+    codes = np.empty(size, np.int32)
     frames = np.empty((count + 1, 12))
     inverse_depth = np.empty((size, size), np.float32)
     ident_of_pixel = np.empty((size, size), np.int32)
@@ -692,7 +700,7 @@ def _render_range(begin, end, pack, scene_index, cameras, focal, lights, objects
              inverse_depth, ident_of_pixel)
         _shade(pack, scene_index[n], frames, objects.scene[n], objects.room[n], lights.cube[n],
                lights.lamps[n], focal[n], most_faces,
-               (slots, slot_of, stamp_of, np.int32(n - begin + 1)),
+               (slots, slot_of, code_of, stamp_of, np.int32(n - begin + 1), codes),
                inverse_depth, ident_of_pixel, rgb[n], depth[n], labels[n], instances[n])
 
 
