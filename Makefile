@@ -13,6 +13,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+READY_ALL := $(VENV)/.ready-all
 SOURCES := setup.py launch test vn_msgs_py vn_nav vn_sim_bridge
 
 # A sourced ROS, or another virtual environment of ROS wheels, shadows ours with its modules,
@@ -35,7 +36,7 @@ demo: $(READY)
 test: $(READY)
 	@$(BIN)/python -m pytest -m 'not slow' --durations=5
 
-test-all: $(READY)
+test-all: $(READY_ALL)
 	@$(BIN)/python -m pytest --durations=20
 
 lint: $(READY)
@@ -63,5 +64,10 @@ $(READY): setup.py constraints.txt
 	@echo "Setting up $(VENV) (ROS 2 Jazzy wheels, PyTorch, tools): once, one to five minutes."
 	@[ "$$($(BIN)/python -c 'import pip, sys; print(sys.prefix)' 2>/dev/null)" = "$(CURDIR)/$(VENV)" ]\
 	 || $(PYTHON) -m venv --clear $(VENV)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,test]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,test]'
+	@touch $@
+
+# The GPU kernels run in Warp's CPU mode too, but only some tests need its 400 MB.
+$(READY_ALL): $(READY)
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu]'
 	@touch $@

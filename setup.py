@@ -82,6 +82,8 @@ setup(
         # Wheels for x86-64 machines without ROS. Where Jazzy is installed they come from apt.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'train': ['tensorboard>=2.16'],
+        'mesh': ['trimesh>=4.5', 'pillow>=10'],  # OBJ, GLB and glTF in and out
+        'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels
         'test': [
             'pytest>=8',
             'pytest-timeout>=2.3',

@@ -9,6 +9,7 @@ from ros_harness import write_checkpoint
 
 from vn_nav.cli import main
 from vn_nav.policy.checkpoint import CONFIG
+from vn_sim_bridge.world import WORLD_VERSION
 
 
 def run(*words):
@@ -38,7 +39,8 @@ def test_bad_input_is_one_line(tmp_path, words, expected):
 def test_another_world_version_is_refused_with_the_remedy(tmp_path, capsys):
     folder = write_checkpoint(tmp_path / 'model', size=36)
     config = (folder / CONFIG).read_text()
-    (folder / CONFIG).write_text(config.replace('"world_version": "1"', '"world_version": "0"'))
+    (folder / CONFIG).write_text(config.replace(f'"world_version": "{WORLD_VERSION}"',
+                                                '"world_version": "0"'))
     for words in (['evaluate', str(folder)],
                   ['demo', '--checkpoint', str(folder), '--out', str(tmp_path / 'demo')]):
         assert main(words) == 2

@@ -149,7 +149,7 @@ def test_starts_follow_the_curriculum():
     easy = info['start_distance']
     env.set_difficulty(1.0)
     _, info = env.reset(seed=0)
-    assert easy.min() >= 1.0 and easy.max() <= 0.3 * 12 + 0.2
+    assert easy.min() >= 1.0 and easy.max() <= 0.3 * 20 + 0.2
     assert info['start_distance'].mean() >= 4.0 > easy.mean()
     with pytest.raises(UserError, match='tau'):
         env.set_difficulty(0.0)

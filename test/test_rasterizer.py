@@ -1,13 +1,17 @@
 """The renderer against a brute-force ray caster, and its promises."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 from vn_nav.errors import UserError
+from vn_sim_bridge.houses.labels import LABELS
+from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.render.rasterizer import Rasterizer
+from vn_sim_bridge.houses.textures import TEXTURES, texture_library
+from vn_sim_bridge.render.rasterizer import Objects, Rasterizer
 from vn_sim_bridge.scene import SceneBuilder
 
 FOV = math.radians(90)
@@ -94,7 +98,7 @@ def test_a_picture_has_colours_and_texture(house):
 
 
 def test_distance_along_the_optical_axis_is_metric():
-    builder = SceneBuilder()
+    builder = SceneBuilder(texture_library())
     builder.polygon([(2, 5, -5), (2, -5, -5), (2, -5, 5), (2, 5, 5)], texture=0, colour=(1, 1, 1),
                     label=3, instance=9)
     render = Rasterizer([builder.build()], 32).render(
@@ -104,11 +108,81 @@ def test_distance_along_the_optical_axis_is_metric():
 
 
 def test_polygons_are_checked():
-    builder = SceneBuilder()
+    builder = SceneBuilder(texture_library())
     common = {'texture': 0, 'colour': (1, 1, 1), 'label': 1, 'instance': 1}
     with pytest.raises(UserError, match='span a plane'):
         builder.polygon([(0, 0, 0), (1, 0, 0), (2, 0, 0)], **common)
     with pytest.raises(UserError, match='one plane'):
         builder.polygon([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.5)], **common)
-    with pytest.raises(UserError, match='span a plane'):
+    with pytest.raises(UserError, match='finite points'):
         builder.polygon([(0, 0, 0), (1, 0, 0), (1, np.nan, 0)], **common)
+
+
+def test_nothing_overflows_however_much_there_is_to_see():
+    rng = np.random.default_rng(0)
+    builder = SceneBuilder(texture_library())
+    for _ in range(6000):  # large polygons of many corners, all around and through the camera
+        angles = np.sort(rng.uniform(0, 2 * math.pi, 15))
+        circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(15)], axis=1)
+        axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        points = rng.normal(size=3) + rng.uniform(0.5, 6) * circle @ axes.T
+        try:
+            builder.polygon(points, texture=int(rng.integers(20)), colour=rng.uniform(0, 1, 3),
+                            label=int(rng.integers(1, 50)), instance=int(rng.integers(1, 9999)))
+        except UserError:
+            continue  # two corners fell together
+        if rng.random() < 0.2:
+            builder.end_group()
+    scene = builder.build()
+    views = np.column_stack([rng.normal(size=(40, 3)), rng.uniform(-3, 3, 40),
+                             rng.uniform(-1.5, 1.5, 40)])
+    for size in (1, 7, 84, 130):
+        rgb, depth, labels, _ = Rasterizer([scene], size).render(np.zeros(40, int), views, FOV)
+        assert np.isfinite(depth).all() and (depth >= 0).all()
+        assert ((labels > 0) == (depth > 0)).all() and labels.max() < 50
+    with pytest.raises(UserError, match='pixels a side'):
+        Rasterizer([scene], 4096)
+
+
+def test_culling_never_takes_away_what_can_be_seen(house):
+    # The same polygons in one group, and therefore drawn without any test for hiding.
+    scene = house.scene
+    whole = dataclasses.replace(
+        scene, group_start=scene.group_start[[0, -1]], group_room=scene.group_room[:1],
+        group_box=np.concatenate([scene.group_box[:, :3].min(0), scene.group_box[:, 3:].max(0)]
+                                 )[None])
+    views = cameras(house, 60, seed=3, tilt=0.8)
+    index = np.zeros(60, int)
+    for size in (84, 50):
+        one = Rasterizer([scene], size).render(index, views, FOV)
+        other = Rasterizer([whole], size).render(index, views, FOV)
+        for part in (1, 2, 3):
+            assert np.array_equal(one[part], other[part])
+
+
+def test_a_moved_object_is_drawn_where_it_stands(house):
+    ball = object_scene('ball')
+    renderer = Rasterizer([house.scene, ball], 84)
+    cell = house.floor.centres()[len(house.floor.centres()) // 2]
+    views = np.array([[*cell, 1.0, yaw, 0.5] for yaw in np.linspace(-3, 3, 12)])
+    away = np.stack([np.cos(views[:, 3]), np.sin(views[:, 3])], axis=1)
+    objects = Objects(np.full((12, 1), 1), np.zeros((12, 1, 4)), np.zeros((12, 1), np.int64))
+    objects.pose[:, 0, :2] = cell + 0.9 * away
+    _, depth, labels, instances = renderer.render(np.zeros(12, int), views, FOV, objects=objects)
+    plain = renderer.render(np.zeros(12, int), views, FOV)
+    seen = instances == 65535
+    assert (seen.sum(axis=(1, 2)) > 60).sum() >= 6  # not where a wall is nearer
+    assert (labels[seen] == LABELS.index('ball')).all() and (depth[seen] < plain[1][seen]).all()
+    assert np.array_equal(labels[~seen], plain[2][~seen])
+
+
+def test_distant_textures_are_averaged_not_sampled():
+    builder = SceneBuilder(texture_library())
+    builder.polygon([(9, 9, -9), (9, -9, -9), (9, -9, 9), (9, 9, 9)],
+                    texture=TEXTURES['weave'], colour=(1, 1, 1), label=1, instance=1, tile=0.5)
+    rgb = Rasterizer([builder.build()], 64).render(
+        np.zeros(1, int), np.array([[0.0, 0, 0, 0, 0]]), FOV)[0]
+    texture = texture_library()
+    start = texture.start[TEXTURES['weave']]
+    assert (texture.texels[start:start + 64 * 64] & 255).std() > 12  # seen from near by
+    assert rgb.std() < 4  # threads far below a pixel are one grey

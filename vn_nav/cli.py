@@ -81,11 +81,20 @@ def build_parser() -> argparse.ArgumentParser:
 
     house = commands.add_parser('house', help='look at an embedded house')
     actions = house.add_subparsers(dest='action', required=True, metavar='ACTION')
-    show = actions.add_parser('show', help='write a contact sheet: views and a map')
-    show.add_argument('--seed', type=int, default=7)
-    show.add_argument('--rooms', type=int, default=5)
-    show.add_argument('--out', type=Path, help='picture to write (default house-SEED.png)')
-    show.set_defaults(run=run_house_show)
+    for name, words, run, out in (
+            ('show', 'write a contact sheet: views and a map', run_house_show, 'png'),
+            ('walk', 'drive with the keyboard', run_house_walk, None),
+            ('export', 'write a mesh that other programs open', run_house_export, 'glb')):
+        action = actions.add_parser(name, help=words)
+        action.add_argument('--seed', type=int, default=7)
+        action.add_argument('--rooms', type=int, default=5)
+        if name != 'export':
+            action.add_argument('--randomisation', default='none' if out else 'standard',
+                                metavar='NAME', help='of light and camera: none, standard, rough '
+                                'or a YAML file')
+        if out:
+            action.add_argument('--out', type=Path, help=f'file (default house-SEED.{out})')
+        action.set_defaults(run=run)
     return parser
 
 
@@ -270,12 +279,34 @@ def run_house_show(args) -> int:
     """`vn_nav house show`."""
     from vn_sim_bridge.houses.contact_sheet import write_contact_sheet
     from vn_sim_bridge.houses.procedural import generate_house
+    from vn_sim_bridge.randomisation import load_randomisation
     house = generate_house(args.seed, rooms=args.rooms)
     path = args.out or Path(f'house-{args.seed}.png')
-    write_contact_sheet(path, house)
+    write_contact_sheet(path, house, load_randomisation(args.randomisation))
     print(f'{path}: {len(house.rooms)} rooms, {house.area:.0f} m2, '
           f'{house.scene.triangle_count} triangles, goals in '
           f'{", ".join(goal.room for goal in house.goals)}')
+    return 0
+
+
+def run_house_walk(args) -> int:
+    """`vn_nav house walk`."""
+    from vn_sim_bridge.houses.procedural import generate_house
+    from vn_sim_bridge.houses.walk import walk
+    from vn_sim_bridge.randomisation import load_randomisation
+    walk(generate_house(args.seed, rooms=args.rooms), load_randomisation(args.randomisation))
+    return 0
+
+
+def run_house_export(args) -> int:
+    """`vn_nav house export`."""
+    from vn_sim_bridge.houses.mesh import export_mesh
+    from vn_sim_bridge.houses.procedural import generate_house
+    house = generate_house(args.seed, rooms=args.rooms)
+    path = args.out or Path(f'house-{args.seed}.glb')
+    export_mesh(house.scene, path)
+    print(f'{path}: {house.scene.triangle_count} triangles, {path.stat().st_size / 1e6:.1f} MB, '
+          'parts named by class and instance')
     return 0
 
 

@@ -171,6 +171,7 @@ def _map(drive: Drive) -> str:
                 f'height="{(box[3] - box[1]) * SCALE:.1f}" {style}/>')
 
     parts = [rect(scene['bounds'], 'fill="var(--floor)"')]
+    parts += [rect(box, 'fill="var(--card)"') for box in scene.get('outside', [])]
     parts += [rect(box, 'fill="var(--wood)" rx="3"') for *box, _ in scene['obstacles']]
     parts += [rect(box, 'fill="var(--wall)"') for box in scene['walls']]
     for room in scene['rooms_list']:

@@ -11,7 +11,9 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.backends.house import HouseBackend
+from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.house import House
+from vn_sim_bridge.randomisation import Randomisation
 
 VIEW = 200  # pixels a side of a view
 COLUMNS = 6
@@ -22,25 +24,30 @@ PAPER, FLOOR, WALL, WOOD, GOAL, INK = (
     (250, 250, 250), (244, 240, 232), (57, 66, 79), (226, 214, 194), (42, 98, 201), (60, 66, 75))
 
 
-def contact_sheet(house: House, *, pictures: int = 24, seed: int = 0) -> np.ndarray:
+def contact_sheet(house: House, randomisation: Randomisation | None = None, *,
+                  pictures: int = 24, seed: int = 0) -> np.ndarray:
     """The goal pictures, views from random free places, and the map below them.
 
     Args:
         house: what to show.
+        randomisation: of light and camera, drawn anew for every picture.
         pictures: in all; those beside the goal pictures are random views.
         seed: of the random views.
 
     Returns:
         [H,W,3] uint8 RGB.
     """
-    backend = HouseBackend([house], [0], robot=RobotSpec(), size=VIEW)
+    backend = HouseBackend([house], [0], robot=RobotSpec(), size=VIEW,
+                           randomisation=randomisation)
     rng = np.random.default_rng(seed)
     views = max(0, pictures - len(house.goals))
     centres = house.floor.centres()
     random = np.column_stack([centres[rng.integers(len(centres), size=views)],
                               rng.uniform(-math.pi, math.pi, views), np.zeros(views)])
     poses = np.concatenate([[goal.pose for goal in house.goals], random])
-    tiles = backend.view(np.zeros(len(poses), np.int64), poses).rgb.transpose(0, 2, 3, 1)
+    looks = backend.appearance(seed, Stream.APPEARANCE, np.arange(len(poses)), 0)
+    tiles = backend.view(np.zeros(len(poses), np.int64), poses, None,
+                         looks).rgb.transpose(0, 2, 3, 1)
     blank = np.full((-len(tiles) % COLUMNS, VIEW, VIEW, 3), PAPER, np.uint8)
     tiles = np.concatenate([tiles, blank])
     rows = [np.concatenate(list(tiles[k:k + COLUMNS]), axis=1)
@@ -90,7 +97,8 @@ def house_map(house: House) -> np.ndarray:
     return plan
 
 
-def write_contact_sheet(path: str | Path, house: House) -> None:
+def write_contact_sheet(path: str | Path, house: House,
+                        randomisation: Randomisation | None = None) -> None:
     """Write the contact sheet as PNG or JPEG, by the file's ending.
 
     Raises:
@@ -101,4 +109,4 @@ def write_contact_sheet(path: str | Path, house: House) -> None:
         raise UserError('a contact sheet is a .png or .jpg file', str(path), 'choose such a name')
     if not path.absolute().parent.is_dir():
         raise UserError('the folder of the contact sheet exists', str(path), 'make it first')
-    cv2.imwrite(str(path), cv2.cvtColor(contact_sheet(house), cv2.COLOR_RGB2BGR))
+    cv2.imwrite(str(path), cv2.cvtColor(contact_sheet(house, randomisation), cv2.COLOR_RGB2BGR))

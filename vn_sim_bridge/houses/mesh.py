@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import re
@@ -20,6 +21,7 @@ GROUP = 64  # triangles culled together
 MAX_TRIANGLES = 8_000_000
 MAX_BYTES = 4 << 30
 MAX_PIXELS = 1 << 28  # of one texture
+PICTURES = ('.png', '.jpg', '.jpeg', '.bmp', '.tga', '.tif', '.tiff', '.webp')
 SUFFIXES = ('.obj', '.glb', '.gltf')
 
 
@@ -45,12 +47,13 @@ def load_mesh(path: str | Path, *, labels: dict[str, str] | None = None,
         UserError: a file that is missing, broken, huge, unlabelled, or refers to one that is.
     """
     path = Path(path)
-    _check_file(path)
     try:
+        import PIL.Image  # noqa: F401
         import trimesh
     except ImportError as error:
         raise UserError('meshes are read by the package trimesh', str(error),
                         'pip install "vn_nav[mesh]"') from error
+    _check_file(path)
     for name in {**(labels or {}), **({'default': default_label} if default_label else {})
                  }.values():
         if name not in LABEL:
@@ -92,6 +95,22 @@ def _check_file(path: Path) -> None:
         if not (path.parent / name).is_file():
             raise UserError(f'every file that {path} refers to exists', name,
                             'copy it beside the mesh, or export the mesh with embedded textures')
+        if Path(name).suffix.lower() in PICTURES:
+            _check_picture(path.parent / name, (path.parent / name).read_bytes())
+
+
+def _check_picture(name, data: bytes) -> None:
+    """A texture can be decoded: readers leave out those that cannot without a word."""
+    import PIL.Image
+    try:
+        with PIL.Image.open(io.BytesIO(data)) as picture:
+            if picture.width * picture.height > MAX_PIXELS:
+                raise UserError(f'a texture has at most {MAX_PIXELS} pixels',
+                                f'{name}: {picture.width} x {picture.height}', 'make it smaller')
+            picture.load()
+    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+        raise UserError('a texture is a whole picture', f'{name}: {error}',
+                        'export it again') from error
 
 
 def _lines(path: Path):
@@ -118,18 +137,26 @@ def _obj_references(path: Path) -> list[str]:
 
 
 def _gltf_references(path: Path) -> list[str]:
-    data = path.read_bytes()
+    data, blob = path.read_bytes(), None
     try:
         if path.suffix.lower() == '.glb':
             magic, _, length, chunk, kind = struct.unpack_from('<4sII I4s', data)
             if magic != b'glTF' or kind != b'JSON' or length != len(data):
                 raise ValueError(f'header says {length} bytes, the file has {len(data)}')
             data = data[20:20 + chunk]
+            blob = path.read_bytes()[20 + chunk + 8:]
         document = json.loads(data)
+        views = document.get('bufferViews', [])
+        for image in document.get('images', []):
+            if blob is not None and 'bufferView' in image:
+                view = views[image['bufferView']]
+                first = view.get('byteOffset', 0)
+                _check_picture(f'{path}, an embedded texture',
+                               blob[first:first + view['byteLength']])
         entries = [*document.get('buffers', []), *document.get('images', [])]
         return [unquote(entry['uri']) for entry in entries
                 if not entry.get('uri', 'data:').startswith('data:')]
-    except (ValueError, struct.error, AttributeError, TypeError, UnicodeDecodeError) as error:
+    except (ValueError, KeyError, IndexError, struct.error, AttributeError, TypeError) as error:
         raise UserError('a mesh file is whole and follows its format', f'{path}: {error}',
                         'export it again') from error
 
@@ -205,9 +232,6 @@ def _surface(mesh, material, path, node):
         return None, None, colour
     if not np.isfinite(uv).all():
         raise UserError('texture coordinates are finite', f'{path}: {node}', 'repair the mesh')
-    if picture.width * picture.height > MAX_PIXELS:
-        raise UserError(f'a texture has at most {MAX_PIXELS} pixels',
-                        f'{path}: {picture.width} x {picture.height}', 'make it smaller')
     return np.asarray(uv, float), picture, colour
 
 
