@@ -307,108 +307,109 @@ def _update_tiles(inverse_depth, tiles):
 
 
 @_exact
-def _draw_face(pack, face, ident, frame, focal, size, polygon, clipped, spans, inverse_depth,
-               ident_of_pixel):
-    """Scan-convert one polygon into the visibility buffer; 1 if it may have covered a pixel."""
+def _draw_faces(pack, first_face, last_face, first_ident, frame, focal, size, polygon, clipped,
+                spans, inverse_depth, ident_of_pixel):
+    """Scan-convert consecutive polygons into the visibility buffer."""
     px, py, pz = frame[0], frame[1], frame[2]
     fx, fy, fz = frame[3], frame[4], frame[5]
     rx, ry, rz = frame[6], frame[7], frame[8]
     dx, dy, dz = frame[9], frame[10], frame[11]
     half = size * 0.5
-    nx, ny, nz = pack.face_plane[face, 0], pack.face_plane[face, 1], pack.face_plane[face, 2]
-    height = nx * px + ny * py + nz * pz - pack.face_plane[face, 3]
-    if height <= 1e-6:
-        return 0  # the camera sees its back
-    count = 0
-    behind = 0
-    for corner in range(pack.face_start[face], pack.face_start[face + 1]):
-        vertex = pack.face_vertices[corner]
-        x = pack.vertices[vertex, 0] - px
-        y = pack.vertices[vertex, 1] - py
-        z = pack.vertices[vertex, 2] - pz
-        depth = np.float32(x * fx + y * fy + z * fz)
-        polygon[count, 0] = x * rx + y * ry + z * rz
-        polygon[count, 1] = x * dx + y * dy + z * dz
-        polygon[count, 2] = depth
-        count += 1
-        if depth < np.float32(NEAR):
-            behind += 1
-    if behind == count:
-        return 0
-    points = polygon
-    if behind > 0:
-        kept = 0
+    limit = np.float32(size)
+    for face in range(np.uint64(first_face), np.uint64(last_face)):
+        ident = np.int32(first_ident + np.int64(face) - first_face)
+        nx, ny, nz = pack.face_plane[face, 0], pack.face_plane[face, 1], pack.face_plane[face, 2]
+        height = nx * px + ny * py + nz * pz - pack.face_plane[face, 3]
+        if height <= 1e-6:
+            continue  # the camera sees its back
+        count = 0
+        behind = 0
+        for corner in range(pack.face_start[face], pack.face_start[face + 1]):
+            vertex = pack.face_vertices[corner]
+            x = pack.vertices[vertex, 0] - px
+            y = pack.vertices[vertex, 1] - py
+            z = pack.vertices[vertex, 2] - pz
+            depth = np.float32(x * fx + y * fy + z * fz)
+            polygon[count, 0] = x * rx + y * ry + z * rz
+            polygon[count, 1] = x * dx + y * dy + z * dz
+            polygon[count, 2] = depth
+            count += 1
+            if depth < np.float32(NEAR):
+                behind += 1
+        if behind == count:
+            continue
+        points = polygon
+        if behind > 0:
+            kept = 0
+            for i in range(count):
+                j = i + 1 if i + 1 < count else 0
+                zi, zj = polygon[i, 2], polygon[j, 2]
+                if zi >= np.float32(NEAR):
+                    clipped[kept, 0] = polygon[i, 0]
+                    clipped[kept, 1] = polygon[i, 1]
+                    clipped[kept, 2] = zi
+                    kept += 1
+                if (zi >= np.float32(NEAR)) != (zj >= np.float32(NEAR)):
+                    t = (np.float32(NEAR) - zi) / (zj - zi)
+                    clipped[kept, 0] = polygon[i, 0] + t * (polygon[j, 0] - polygon[i, 0])
+                    clipped[kept, 1] = polygon[i, 1] + t * (polygon[j, 1] - polygon[i, 1])
+                    clipped[kept, 2] = np.float32(NEAR)
+                    kept += 1
+            points = clipped
+            count = kept
+        low_x, high_x = np.float32(1e30), np.float32(-1e30)
+        low_y, high_y = np.float32(1e30), np.float32(-1e30)
+        for i in range(count):
+            scale = np.float32(focal) / points[i, 2]
+            x = points[i, 0] * scale + np.float32(half)
+            y = points[i, 1] * scale + np.float32(half)
+            points[i, 0] = x
+            points[i, 1] = y
+            low_x, high_x = min(low_x, x), max(high_x, x)
+            low_y, high_y = min(low_y, y), max(high_y, y)
+        if high_x <= 0.5 or low_x >= size - 0.5 or high_y <= 0.5 or low_y >= size - 0.5:
+            continue
+        # Pixels whose centre lies in [low, high): from int(low + 0.5) to below int(high + 0.5).
+        first_row = np.int32(max(low_y, np.float32(0.0)) + np.float32(0.5))
+        last_row = np.int32(min(high_y, limit) + np.float32(0.5))
+        if first_row >= last_row:
+            continue
+        for row in range(np.uint64(first_row), np.uint64(last_row)):
+            spans[row] = limit
+            spans[row + RIGHT] = np.float32(0.0)
         for i in range(count):
             j = i + 1 if i + 1 < count else 0
-            zi, zj = polygon[i, 2], polygon[j, 2]
-            if zi >= np.float32(NEAR):
-                clipped[kept, 0] = polygon[i, 0]
-                clipped[kept, 1] = polygon[i, 1]
-                clipped[kept, 2] = zi
-                kept += 1
-            if (zi >= np.float32(NEAR)) != (zj >= np.float32(NEAR)):
-                t = (np.float32(NEAR) - zi) / (zj - zi)
-                clipped[kept, 0] = polygon[i, 0] + t * (polygon[j, 0] - polygon[i, 0])
-                clipped[kept, 1] = polygon[i, 1] + t * (polygon[j, 1] - polygon[i, 1])
-                clipped[kept, 2] = np.float32(NEAR)
-                kept += 1
-        points = clipped
-        count = kept
-    low_x, high_x = np.float32(1e30), np.float32(-1e30)
-    low_y, high_y = np.float32(1e30), np.float32(-1e30)
-    for i in range(count):
-        scale = np.float32(focal) / points[i, 2]
-        x = points[i, 0] * scale + np.float32(half)
-        y = points[i, 1] * scale + np.float32(half)
-        points[i, 0] = x
-        points[i, 1] = y
-        low_x, high_x = min(low_x, x), max(high_x, x)
-        low_y, high_y = min(low_y, y), max(high_y, y)
-    if high_x <= 0.5 or low_x >= size - 0.5 or high_y <= 0.5 or low_y >= size - 0.5:
-        return 0
-    # Pixels whose centre lies in [low, high): from int(low + 0.5) to below int(high + 0.5).
-    limit = np.float32(size)
-    first_row = np.int32(max(low_y, np.float32(0.0)) + np.float32(0.5))
-    last_row = np.int32(min(high_y, limit) + np.float32(0.5))
-    if first_row >= last_row:
-        return 0
-    for row in range(np.uint64(first_row), np.uint64(last_row)):
-        spans[row] = limit
-        spans[row + RIGHT] = np.float32(0.0)
-    for i in range(count):
-        j = i + 1 if i + 1 < count else 0
-        x0, y0, x1, y1 = points[i, 0], points[i, 1], points[j, 0], points[j, 1]
-        if y0 == y1:
-            continue
-        if y0 > y1:
-            x0, x1 = x1, x0
-            y0, y1 = y1, y0
-        start = np.int32(min(max(y0, np.float32(0.0)), limit) + np.float32(0.5))
-        stop = np.int32(min(max(y1, np.float32(0.0)), limit) + np.float32(0.5))
-        gradient = (x1 - x0) / (y1 - y0)
-        y0 -= np.float32(0.5)  # of a row's centre; kept apart from x0, which it may dwarf
-        for row in range(np.uint64(start), np.uint64(stop)):
-            x = x0 + (np.float32(np.int32(row)) - y0) * gradient
-            spans[row] = min(spans[row], x)
-            spans[row + RIGHT] = max(spans[row + RIGHT], x)
-    # 1 / depth is affine in the pixel: n . direction / -height.
-    across = (nx * rx + ny * ry + nz * rz) / (-height * focal)
-    along = (nx * dx + ny * dy + nz * dz) / (-height * focal)
-    base = ((nx * fx + ny * fy + nz * fz) / -height + (0.5 - half) * across
-            + (0.5 - half) * along)
-    slope_x = np.float32(across)
-    for row in range(np.uint64(first_row), np.uint64(last_row)):
-        begin = np.int32(max(spans[row], np.float32(0.0)) + np.float32(0.5))
-        end = np.int32(min(spans[row + RIGHT], limit) + np.float32(0.5))
-        row_value = np.float32(base + np.int32(row) * along)
-        inverses, idents = inverse_depth[row], ident_of_pixel[row]
-        for column in range(np.uint64(begin), np.uint64(max(begin, end))):
-            value = row_value + np.float32(np.int32(column)) * slope_x
-            old, other = inverses[column], idents[column]
-            wins = (value > old) | ((value == old) & (ident < other))
-            inverses[column] = value if wins else old
-            idents[column] = ident if wins else other
-    return 1
+            x0, y0, x1, y1 = points[i, 0], points[i, 1], points[j, 0], points[j, 1]
+            if y0 == y1:
+                continue
+            if y0 > y1:
+                x0, x1 = x1, x0
+                y0, y1 = y1, y0
+            start = np.int32(min(max(y0, np.float32(0.0)), limit) + np.float32(0.5))
+            stop = np.int32(min(max(y1, np.float32(0.0)), limit) + np.float32(0.5))
+            gradient = (x1 - x0) / (y1 - y0)
+            y0 -= np.float32(0.5)  # of a row's centre; kept apart from x0, which it may dwarf
+            for row in range(np.uint64(start), np.uint64(stop)):
+                x = x0 + (np.float32(np.int32(row)) - y0) * gradient
+                spans[row] = min(spans[row], x)
+                spans[row + RIGHT] = max(spans[row + RIGHT], x)
+        # 1 / depth is affine in the pixel: n . direction / -height.
+        across = (nx * rx + ny * ry + nz * rz) / (-height * focal)
+        along = (nx * dx + ny * dy + nz * dz) / (-height * focal)
+        base = ((nx * fx + ny * fy + nz * fz) / -height + (0.5 - half) * across
+                + (0.5 - half) * along)
+        slope_x = np.float32(across)
+        for row in range(np.uint64(first_row), np.uint64(last_row)):
+            begin = np.int32(max(spans[row], np.float32(0.0)) + np.float32(0.5))
+            end = np.int32(min(spans[row + RIGHT], limit) + np.float32(0.5))
+            row_value = np.float32(base + np.int32(row) * along)
+            inverses, idents = inverse_depth[row], ident_of_pixel[row]
+            for column in range(np.uint64(begin), np.uint64(max(begin, end))):
+                value = row_value + np.float32(np.int32(column)) * slope_x
+                old, other = inverses[column], idents[column]
+                wins = (value > old) | ((value == old) & (ident < other))
+                inverses[column] = value if wins else old
+                idents[column] = ident if wins else other
 
 
 @_exact
@@ -438,7 +439,7 @@ def _see(pack, scene, frames, objects, focal, size, most_faces, work, inverse_de
         place = min(int(near[k] / BIN_DEPTH), BINS - 1)
         order[bin_start[place]] = k
         bin_start[place] += 1
-    base = pack.group_start[first]
+    base = np.int64(pack.group_start[first])
     fresh = 0
     known = False
     horizon = 1e30  # m: everything that can be seen is nearer
@@ -455,9 +456,9 @@ def _see(pack, scene, frames, objects, focal, size, most_faces, work, inverse_de
                 continue
             if known and _hidden(pack.group_box[group], frame, focal, size, tiles):
                 continue
-        for face in range(pack.group_start[group], pack.group_start[group + 1]):
-            _draw_face(pack, face, np.int32(face - base), frame, focal, size, polygon, clipped,
-                       spans, inverse_depth, ident_of_pixel)
+        begin = np.int64(pack.group_start[group])
+        _draw_faces(pack, begin, np.int64(pack.group_start[group + 1]), begin - base, frame, focal,
+                    size, polygon, clipped, spans, inverse_depth, ident_of_pixel)
         fresh += 1
     for m in range(objects.shape[0]):
         if objects[m] < 0:
@@ -466,11 +467,10 @@ def _see(pack, scene, frames, objects, focal, size, most_faces, work, inverse_de
         for group in range(first, last):
             if _nearest_depth(pack.group_box[group], frames[m + 1], slope) < 0.0:
                 continue
-            for face in range(pack.group_start[group], pack.group_start[group + 1]):
-                _draw_face(pack, face,
-                           np.int32((m + 1) * most_faces + face - pack.group_start[first]),
-                           frames[m + 1], focal, size, polygon, clipped, spans, inverse_depth,
-                           ident_of_pixel)
+            begin = np.int64(pack.group_start[group])
+            _draw_faces(pack, begin, np.int64(pack.group_start[group + 1]),
+                        (m + 1) * most_faces + begin - pack.group_start[first], frames[m + 1],
+                        focal, size, polygon, clipped, spans, inverse_depth, ident_of_pixel)
 
 
 _shading = numba.njit(cache=True, fastmath=True, error_model='numpy')
@@ -508,23 +508,22 @@ def _prepare(pack, face, frame, focal, half, cube, lamp, slot):
 
 
 @_shading
-def _light_at(pack, face, u, v):
+def _light_at(face_light, face_light_map, light, face, u, v):
     """Ambient and lamp factor (0 to 65280 each) of a surface point, bilinear in sixteenths."""
-    width = pack.face_light[face, 1]
+    width = face_light[face, 1]
     limit = np.float32(width - 1) * np.float32(16.0)
-    x = u * pack.face_light_map[face, 0] + pack.face_light_map[face, 1]
-    y = v * pack.face_light_map[face, 2] + pack.face_light_map[face, 3]
+    x = u * face_light_map[face, 0] + face_light_map[face, 1]
+    y = v * face_light_map[face, 2] + face_light_map[face, 3]
     i = np.int32(max(min(x * np.float32(16.0), limit), np.float32(0.0)))
     j = np.int32(max(min(y * np.float32(16.0), np.float32(LAST_NODE)), np.float32(0.0)))
-    node = np.uint64(pack.face_light[face, 0] + (j >> 4) * width + (i >> 4))
+    node = np.uint64(face_light[face, 0] + (j >> 4) * width + (i >> 4))
     wx, wy = np.uint64(i & 15), np.uint64(j & 15)
     # A sum of four lanes of 16 bits, none of which can overflow: 255 * 16 * 16 < 65536.
-    mixed = (pack.light[node] * (np.uint64(16) - wy)
-             + pack.light[node + np.uint64(width)] * wy)
-    light = ((mixed & np.uint64(0xFFFFFFFF)) * (np.uint64(16) - wx)
+    mixed = light[node] * (np.uint64(16) - wy) + light[node + np.uint64(width)] * wy
+    sums = ((mixed & np.uint64(0xFFFFFFFF)) * (np.uint64(16) - wx)
              + (mixed >> np.uint64(32)) * wx)
-    return (np.float32(np.int32(light & np.uint64(0xFFFF))),
-            np.float32(np.int32(light >> np.uint64(16))))
+    return (np.float32(np.int32(sums & np.uint64(0xFFFF))),
+            np.float32(np.int32(sums >> np.uint64(16))))
 
 
 @_shading
@@ -549,6 +548,7 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
     nothing = np.int32(len(code_of) - 1)  # the entry of pixels that show none
     code_of[nothing] = 0
     first_face = pack.group_start[pack.scene_group[scene]]
+    face_light, face_light_map, light = pack.face_light, pack.face_light_map, pack.light
     for row in range(size):
         idents = ident_of_pixel[row]
         inverses, depths = inverse_depth[row], depth[row]
@@ -599,9 +599,10 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
             v_row = s[6] + np.float32(row) * s[5]
             z = depths[begin]
             if not lit:
+                x = np.float32(begin)
                 ambient, lamp = _light_at(
-                    pack, face, u_offset + z * (u_row + np.float32(begin) * s[0]),
-                    v_offset + z * (v_row + np.float32(begin) * s[4]))
+                    face_light, face_light_map, light, face,
+                    u_offset + z * (u_row + x * s[0]), v_offset + z * (v_row + x * s[4]))
                 red = _fixed(ambient, lamp, s[10], s[13])
                 green = _fixed(ambient, lamp, s[11], s[14])
                 blue = _fixed(ambient, lamp, s[12], s[15])
@@ -611,9 +612,10 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
             red_step = green_step = blue_step = np.int32(0)
             if last > begin + 1:
                 far_z = depths[last]
+                x = np.float32(last)
                 ambient, lamp = _light_at(
-                    pack, face, u_offset + far_z * (u_row + np.float32(last) * s[0]),
-                    v_offset + far_z * (v_row + np.float32(last) * s[4]))
+                    face_light, face_light_map, light, face,
+                    u_offset + far_z * (u_row + x * s[0]), v_offset + far_z * (v_row + x * s[4]))
                 next_red = _fixed(ambient, lamp, s[10], s[13])
                 next_green = _fixed(ambient, lamp, s[11], s[14])
                 next_blue = _fixed(ambient, lamp, s[12], s[15])
