@@ -11,6 +11,7 @@ import time
 import numpy as np
 
 from vn_nav.cli import machine
+from vn_sim_bridge.houses import procedural
 from vn_sim_bridge.houses.house import main_component
 from vn_sim_bridge.houses.procedural import MAX_ROOMS, generate_house
 
@@ -19,7 +20,12 @@ def main():
     """Seeds from 0 on, with 1 to 12 rooms in turn."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--count', type=int, default=10_000)
+    parser.add_argument('--plain', action='store_true',
+                        help='leave out light and goals, which come last and change no geometry')
     arguments = parser.parse_args()
+    if arguments.plain:
+        procedural.light_baker = lambda *_: None
+        procedural.choose_goals = lambda *_: []
     seen, triangles, goals, wings, begun = set(), [], 0, 0, time.perf_counter()
     for seed in range(arguments.count):
         house = generate_house(seed, rooms=1 + seed % MAX_ROOMS)
