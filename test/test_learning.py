@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.learning.curriculum import FrameCurriculum
 from vn_nav.learning.returns import generalised_advantages, normalise
 from vn_nav.learning.trainer import TrainConfig, train
 from vn_nav.observation import Observation
@@ -275,3 +276,17 @@ def test_a_small_room_is_learned(tmp_path):
                                      random_actor(test, 0)))
     print(f'learned {learned["success"]:.2f}, random {chance["success"]:.2f}')
     assert learned['success'] >= 0.75 and learned['success'] > chance['success'] + 0.25
+
+
+def test_the_frame_curriculum_follows_the_thesis():
+    # Thesis: 0.3 until 5e6 of 4e7 frames, 1.0 from 1e7 on.
+    curriculum = FrameCurriculum()
+    taus = []
+    for frames in (0, 4.9e6, 7.5e6, 1e7, 4e7):
+        curriculum.advance(frames / 4e7)
+        taus.append(curriculum.tau)
+    assert taus == pytest.approx([0.3, 0.3, 0.65, 1.0, 1.0])
+    assert not curriculum.advance(1.0)
+    other = FrameCurriculum()
+    other.load_state_dict(curriculum.state_dict())
+    assert other.tau == 1.0

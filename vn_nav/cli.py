@@ -36,6 +36,8 @@ def build_parser() -> argparse.ArgumentParser:
 
     train = commands.add_parser('train', help='train a policy')
     _add_world(train)
+    train.add_argument('--task', default='image', help='image, object, room or collect')
+    train.add_argument('--objects', type=int, default=1, help='in the house at a time')
     train.add_argument('--out', type=Path, required=True, help='folder of the run')
     train.add_argument('--resume', action='store_true', help='go on with the run in --out')
     train.add_argument('--frames', type=float, default=1.5e6, help='agent decisions')
@@ -133,7 +135,8 @@ def run_train(args) -> int:
     houses = args.house or [0]
     env = make_env(houses, args.rooms, args.envs, robot=args.robot, threads=args.threads,
                    randomisation=args.randomisation, size=args.size, seed=args.seed,
-                   actions=tuple(args.actions.split(',')),
+                   actions=tuple(args.actions.split(',')), task=args.task,
+                   objects=args.objects,
                    progress_reward=args.progress_reward, collision_reward=args.collision_reward)
     config = TrainConfig(
         frames=int(args.frames), minutes=args.minutes, rollout_length=args.rollout_length,
@@ -146,7 +149,7 @@ def run_train(args) -> int:
     words = [word for word in sys.argv[1:] if word != '--resume']
     info = {
         'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
-        'command': 'vn_nav ' + shlex.join(words),
+        'task': args.task, 'objects': args.objects, 'command': 'vn_nav ' + shlex.join(words),
         'camera_fov_deg': math.degrees(env.robot.camera_fov),
         'camera_height': env.robot.camera_height,
         'notes': f'Trained on {machine()}, {args.threads} thread(s), '
@@ -196,6 +199,7 @@ def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, control
     from vn_nav.evaluation.evaluator import evaluate
     env = make_env(houses, rooms, min(50, episodes), robot=robot, size=checkpoint.config.size,
                    randomisation=randomisation or checkpoint.info['randomisation'],
+                   task=checkpoint.info['task'], objects=checkpoint.info['objects'],
                    actions=checkpoint.config.actions, max_decisions=max_decisions)
     return evaluate(env, checkpoint.network, decoding=decoding or checkpoint.info['decoding'],
                     episodes=episodes, controls=controls, seed=seed)
@@ -270,7 +274,9 @@ def run_demo(args) -> int:
     from vn_nav.demo import run
     from vn_nav.resources import share_file
     folder = args.checkpoint or share_file('models/house')
-    _load(folder)  # refuse before anything is written
+    if _load(folder).info['task'] != 'image':  # refuse before anything is written
+        raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
+                        _load(folder).info['task'], 'use vn_nav evaluate')
     return run(args.out, folder, make_env=make_env, episodes=args.episodes,
                unseen_episodes=args.unseen_episodes)
 

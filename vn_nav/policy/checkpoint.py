@@ -33,6 +33,8 @@ INFO = {
     'decoding': 'sample',  # the rule that `results` were measured with
     'houses': [],  # seeds
     'rooms': None,  # of each house
+    'task': 'image',  # what it was trained for
+    'objects': 1,  # in the house at a time
     'randomisation': 'none',  # of light, camera and base: a name, or a file's path
     'seed': None,
     'frames': 0,  # agent decisions

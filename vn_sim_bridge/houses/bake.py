@@ -58,8 +58,8 @@ def _voxelise(starts, vertices, origin, solid):
         first, last = starts[face], starts[face + 1]
         for corner in range(first + 1, last - 1):
             ax, ay, az = vertices[first]
-            bx, by, bz = vertices[corner, 0] - ax, vertices[corner, 1] - ay, vertices[corner,
-                                                                                     2] - az
+            bx, by, bz = (vertices[corner, 0] - ax, vertices[corner, 1] - ay,
+                          vertices[corner, 2] - az)
             cx, cy, cz = (vertices[corner + 1, 0] - ax, vertices[corner + 1, 1] - ay,
                           vertices[corner + 1, 2] - az)
             n = 2 + int(math.sqrt(bx * bx + by * by + bz * bz) / (0.7 * CELL))

@@ -521,7 +521,7 @@ def _light_at(face_light, face_light_map, light, face, u, v):
     # A sum of four lanes of 16 bits, none of which can overflow: 255 * 16 * 16 < 65536.
     mixed = light[node] * (np.uint64(16) - wy) + light[node + np.uint64(width)] * wy
     sums = ((mixed & np.uint64(0xFFFFFFFF)) * (np.uint64(16) - wx)
-             + (mixed >> np.uint64(32)) * wx)
+            + (mixed >> np.uint64(32)) * wx)
     return (np.float32(np.int32(sums & np.uint64(0xFFFF))),
             np.float32(np.int32(sums >> np.uint64(16))))
 
