@@ -162,3 +162,29 @@ def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
         turns.append(abs(np.degrees(wrap_angle(env.backend.poses[0, 2] - yaw))))
     assert max(distances) < 0.02 and max(turns) < 2.0, (max(distances), max(turns))
     print(f'largest difference {max(distances) * 1000:.2f} mm, {max(turns):.4f} deg')
+
+
+def test_nothing_is_compiled_once_the_robot_runs():
+    # A compilation takes seconds, in which the camera is silent and the policy stops the robot.
+    code = """
+import numba.core.dispatcher as dispatcher, numpy as np
+from vn_nav.robot import RobotSpec
+from vn_sim_bridge.randomisation import load_randomisation
+from vn_sim_bridge.simulated_robot import SimulatedRobot
+robot = SimulatedRobot(7, 2, robot=RobotSpec(), size=40, randomisation=load_randomisation('rough'))
+robot.begin_episode(0)
+robot.goal_frames()
+def compile(self, signature):
+    raise SystemExit(f'compiles {self.py_func.__name__} {signature}')
+dispatcher.Dispatcher.compile = compile
+for index in range(3):
+    for command in ((0.5, 0, 0, 0), (0, 0, 0, 0), (0, 0, 1, 0), (0, 0, 0, 0)):
+        robot.tick(np.array(command, float))
+        robot.observe()
+        robot.observe()
+    robot.begin_episode(index + 1)
+    robot.goal_frames()
+print('done')
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.stdout.strip() == 'done', done.stdout + done.stderr

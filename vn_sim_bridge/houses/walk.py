@@ -71,7 +71,7 @@ class Walk:
         x, y, yaw, pitch = self.backend.poses[0]
         seen = LABELS[frames.labels[0, middle, middle]].replace('_', ' ')
         return (f'{self.house.room_at(x, y) or "doorway"}   x {x:.2f}  y {y:.2f} m  '
-                f'heading {math.degrees(yaw):.0f}  tilt {math.degrees(-pitch):.0f} deg   '
+                f'heading {math.degrees(yaw):.0f}  tilt {0.0 - math.degrees(pitch):.0f} deg   '
                 f'{seen} at {frames.depth[0, middle, middle]:.2f} m'
                 f'{"   touching something" if self.touched else ""}')
 

@@ -133,8 +133,13 @@ class Rasterizer:
                    np.empty((count, size, size), np.float32),
                    np.empty((count, size, size), np.uint8),
                    np.empty((count, size, size), np.uint16))
-        lights = lights or standard_lights(count, self.rooms)
+        # One type for every call: the kernels are compiled once, and a robot never waits for it.
+        lights = Lights(*(np.ascontiguousarray(part, np.float32) for part in (
+            lights or standard_lights(count, self.rooms))))
         objects = objects or no_objects(count)
+        objects = Objects(np.ascontiguousarray(objects.scene, np.int64),
+                          np.ascontiguousarray(objects.pose, np.float64),
+                          np.ascontiguousarray(objects.room, np.int64))
         focal = np.broadcast_to(size / 2 / np.tan(np.asarray(fov, float) / 2), (count,))
         kernel = _render_parallel if self.threads > 1 else _render_serial
         before = numba.get_num_threads()
@@ -142,7 +147,7 @@ class Rasterizer:
         numba.set_num_threads(threads)
         kernel(self.pack, np.ascontiguousarray(scene_index, np.int64),
                np.ascontiguousarray(cameras, np.float64), np.ascontiguousarray(focal),
-               lights, objects, self.most_faces, self.most_groups, out, threads)
+               lights, objects, self.most_faces, self.most_groups, tuple(out), threads)
         numba.set_num_threads(before)
         return out
 

@@ -15,7 +15,8 @@ def expose(rgb: np.ndarray, noise: np.ndarray, blur: np.ndarray, keys: np.ndarra
         blur: [N] float32, length of a horizontal box filter as a share of the width.
         keys: [N] uint64, of the noise: equal keys give equal noise.
     """
-    _expose(rgb, noise, np.rint(blur * rgb.shape[-1]).astype(np.int64), keys)
+    _expose(rgb, np.ascontiguousarray(noise, np.float32),
+            np.rint(blur * rgb.shape[-1]).astype(np.int64), np.ascontiguousarray(keys, np.uint64))
 
 
 @numba.njit(cache=True)
