@@ -257,6 +257,7 @@ def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path):
     assert all(torch.equal(one[name], two[name]) for name in one)
 
 
+@pytest.mark.slow  # a minute
 @pytest.mark.timeout(200)
 def test_a_small_room_is_learned(tmp_path):
     """From the random level to three quarters of all episodes, in about a minute."""
