@@ -25,7 +25,8 @@ from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
 from vn_sim_bridge.randomisation import draw_appearance, load_randomisation
-from vn_sim_bridge.render.rasterizer import Lights, Rasterizer
+from vn_sim_bridge.render.pack import Lights
+from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.sensor import expose
 from vn_sim_bridge.scene import Scene, SceneBuilder
 

@@ -284,10 +284,10 @@ def test_the_frame_curriculum_follows_the_thesis():
     curriculum = FrameCurriculum()
     taus = []
     for frames in (0, 4.9e6, 7.5e6, 1e7, 4e7):
-        curriculum.advance(frames / 4e7)
+        curriculum.update([], np.zeros(1), frames / 4e7)
         taus.append(curriculum.tau)
     assert taus == pytest.approx([0.3, 0.3, 0.65, 1.0, 1.0])
-    assert not curriculum.advance(1.0)
+    assert not curriculum.update([], np.zeros(1), 1.0)
     other = FrameCurriculum()
     other.load_state_dict(curriculum.state_dict())
     assert other.tau == 1.0

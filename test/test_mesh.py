@@ -134,7 +134,7 @@ def test_a_truncated_glb_is_refused(tmp_path):
         with pytest.raises(UserError, match='cut.glb'):
             load_mesh(tmp_path / 'cut.glb')
     marker = data.index(b'\x89PNG')
-    (tmp_path / 'cut.glb').write_bytes(data[:marker] + b'XXXX' + data[marker + 4:])
+    (tmp_path / 'cut.glb').write_bytes(data[:marker] + bytes(4) + data[marker + 4:])
     with pytest.raises(UserError, match='cut.glb'):  # a broken embedded texture
         load_mesh(tmp_path / 'cut.glb')
     chunk = struct.unpack_from('<I', data, 12)[0]

@@ -11,7 +11,8 @@ from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
-from vn_sim_bridge.render.rasterizer import Objects, Rasterizer
+from vn_sim_bridge.render.pack import Objects
+from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.scene import SceneBuilder
 
 FOV = math.radians(90)

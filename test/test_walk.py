@@ -16,14 +16,14 @@ from vn_sim_bridge.randomisation import load_randomisation
 
 def test_keys_move_turn_look_and_change_the_light():
     walk = Walk(generate_house(7, rooms=2), 48, load_randomisation('standard'))
-    start, first = walk.backend.poses[0].copy(), walk.picture()
+    start, first = walk.backend.poses[0].copy(), walk.look()[0]
     assert walk.press('a') and walk.backend.poses[0, 2] > start[2]
     assert walk.press('d') and np.allclose(walk.backend.poses[0], start)
     assert walk.press('r') and walk.backend.poses[0, 3] < 0 and walk.press('f')
-    assert walk.press('l') and not np.array_equal(walk.picture(), first)
+    assert walk.press('l') and not np.array_equal(walk.look()[0], first)
     for _ in range(60):
         walk.press('w')
-    assert walk.touched and 'touching' in walk.status()
+    assert walk.touched and 'touching' in walk.look()[1]
     assert not walk.press('x')
 
 

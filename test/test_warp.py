@@ -14,7 +14,8 @@ from vn_sim_bridge.env import EnvConfig, NavigationEnv
 from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.randomisation import draw_appearance, load_randomisation
-from vn_sim_bridge.render.rasterizer import Lights, Objects, Rasterizer
+from vn_sim_bridge.render.pack import Lights, Objects
+from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.sensor import expose
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]

@@ -274,9 +274,10 @@ def run_demo(args) -> int:
     from vn_nav.demo import run
     from vn_nav.resources import share_file
     folder = args.checkpoint or share_file('models/house')
-    if _load(folder).info['task'] != 'image':  # refuse before anything is written
+    task = _load(folder).info['task']  # refuse before anything is written
+    if task != 'image':
         raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
-                        _load(folder).info['task'], 'use vn_nav evaluate')
+                        task, 'use vn_nav evaluate')
     return run(args.out, folder, make_env=make_env, episodes=args.episodes,
                unseen_episodes=args.unseen_episodes)
 

@@ -18,10 +18,9 @@ import yaml
 from vn_nav.errors import UserError
 from vn_nav.resources import share_file
 from vn_sim_bridge.counter_random import Stream, normal, uniform
-from vn_sim_bridge.render.rasterizer import FACING
+from vn_sim_bridge.render.pack import FACING
 
 Range = tuple[float, float]
-MAX_BLUR = 15  # pixels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Randomisation:
 class Appearance(NamedTuple):
     """Light and camera of K pictures."""
 
-    cube: np.ndarray  # [K,6,3] float32, see `rasterizer.Lights`
+    cube: np.ndarray  # [K,6,3] float32, see `pack.Lights`
     lamps: np.ndarray  # [K,R,3] float32
     fov: np.ndarray  # [K] float64 rad, added to the robot's
     height: np.ndarray  # [K] float64 m, added

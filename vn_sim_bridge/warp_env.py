@@ -21,7 +21,7 @@ from vn_sim_bridge.env import EnvConfig
 from vn_sim_bridge.houses.house import CELL
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.randomisation import draw_appearance
-from vn_sim_bridge.render.rasterizer import FACING
+from vn_sim_bridge.render.pack import FACING
 from vn_sim_bridge.render.warp_renderer import WarpRenderer
 from vn_sim_bridge.world import (
     MAX_TILT,

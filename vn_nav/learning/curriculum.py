@@ -37,13 +37,14 @@ class Curriculum:
         """Success over the window, nan while it is empty."""
         return float(np.mean(self.successes)) if self.successes else float('nan')
 
-    def update(self, episodes: list[Episode], present: np.ndarray) -> bool:
+    def update(self, episodes: list[Episode], present: np.ndarray, progress: float) -> bool:
         """Count finished episodes; True when tau grew.
 
         Args:
             episodes: the newly finished ones.
             present: [N] number of the episode that each environment is in now; those began at the
                 old tau.
+            progress: share of the training that is over; of no concern here.
         """
         for episode in episodes:
             if episode.number >= self._first[episode.env]:
@@ -87,8 +88,8 @@ class FrameCurriculum:
         self.start, self.begin, self.end = start, begin, end
         self.tau = start
 
-    def advance(self, progress: float) -> bool:
-        """Set tau for a share of the training that is over; True when it changed."""
+    def update(self, episodes: list[Episode], present: np.ndarray, progress: float) -> bool:
+        """Set tau for a share of the training that is over, see `Curriculum`."""
         share = min(max((progress - self.begin) / (self.end - self.begin), 0.0), 1.0)
         before, self.tau = self.tau, self.start + (1.0 - self.start) * share
         return self.tau != before

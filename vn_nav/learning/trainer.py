@@ -186,8 +186,7 @@ class _Training:
         self.clock = end
         self.recent.extend(episodes)
         tau = self.curriculum.tau
-        if (self.curriculum.advance(self.progress) if self.config.curriculum == 'frames'
-                else self.curriculum.update(episodes, self.collector.number)):
+        if self.curriculum.update(episodes, self.collector.number, self.progress):
             self.env.set_difficulty(self.curriculum.tau)
         decisions = max(sum(episode.decisions for episode in self.recent), 1)
         return dict(zip(COLUMNS, (

@@ -13,7 +13,8 @@ from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.randomisation import Appearance, Randomisation, draw_appearance
-from vn_sim_bridge.render.rasterizer import Lights, Objects, Rasterizer
+from vn_sim_bridge.render.pack import Lights, Objects, no_objects
+from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.sensor import expose
 from vn_sim_bridge.tasks import Placed
 from vn_sim_bridge.world import WORLD_VERSION, World
@@ -50,9 +51,7 @@ class HouseBackend:
         self.randomisation = randomisation or Randomisation()
         self._renderer = Rasterizer([*(house.scene for house in self.houses),
                                      *map(object_scene, models)], size, threads=threads)
-        self.objects = Objects(np.full((self.num_envs, objects), -1, np.int64),
-                               np.zeros((self.num_envs, objects, 4)),
-                               np.zeros((self.num_envs, objects), np.int64))
+        self.objects = no_objects(self.num_envs, objects)
         self._all = np.arange(self.num_envs)
         self._frames = None
         self._appearance = None
@@ -87,12 +86,16 @@ class HouseBackend:
 
     def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
         """Put these objects, and no others, into the house of one robot."""
-        house = self.houses[self.world.house_index[env_id]]
-        self.objects.scene[env_id] = -1
+        self._stand(self.objects, env_id, self.world.house_index[env_id], placed)
+
+    def _stand(self, objects: Objects, row: int, house_index: int, placed: Sequence[Placed]
+               ) -> None:
+        house = self.houses[house_index]
+        objects.scene[row] = -1
         for m, item in enumerate(placed):
-            self.objects.scene[env_id, m] = len(self.houses) + item.model
-            self.objects.pose[env_id, m] = item.x, item.y, 0.0, item.yaw
-            self.objects.room[env_id, m] = house.room_index(item.x, item.y)
+            objects.scene[row, m] = len(self.houses) + item.model
+            objects.pose[row, m] = item.x, item.y, 0.0, item.yaw
+            objects.room[row, m] = house.room_index(item.x, item.y)
 
     def object_models(self) -> np.ndarray:
         """[N,M] int64: which model each object is; -1: absent."""
@@ -106,15 +109,13 @@ class HouseBackend:
             env_ids: [K] which robots; default all.
             keys: [K] uint64, of the sensor's noise; default: one noise for every call.
         """
-        ids = self._all if env_ids is None else env_ids
-        appearance = Appearance(*(part[ids] for part in self._appearance))
-        out = self._frames if env_ids is None else None
-        objects = Objects(*(part[ids] for part in self.objects))
-        frames = self._draw(self.world.house_index[ids], self.world.poses[ids], out, appearance,
-                            keys, objects)
         if env_ids is None:
-            self._frames = frames
-        return frames
+            self._frames = self._draw(self.world.house_index, self.world.poses, self._frames,
+                                      self._appearance, keys, self.objects)
+            return self._frames
+        return self._draw(self.world.house_index[env_ids], self.world.poses[env_ids], None,
+                          Appearance(*(part[env_ids] for part in self._appearance)), keys,
+                          Objects(*(part[env_ids] for part in self.objects)))
 
     def view(self, house_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
              appearance: Appearance | None = None, keys: np.ndarray | None = None,
@@ -130,15 +131,10 @@ class HouseBackend:
             appearance = draw_appearance(Randomisation(), self._renderer.rooms, 0,
                                          Stream.APPEARANCE, np.arange(len(poses)), 0)
         objects = None
-        if placed is not None and (most := max(map(len, placed))):
-            objects = Objects(np.full((len(poses), most), -1, np.int64),
-                              np.zeros((len(poses), most, 4)),
-                              np.zeros((len(poses), most), np.int64))
+        if placed is not None:
+            objects = no_objects(len(poses), max(map(len, placed)))
             for k, items in enumerate(placed):
-                for m, item in enumerate(items):
-                    objects.scene[k, m] = len(self.houses) + item.model
-                    objects.pose[k, m] = item.x, item.y, 0.0, item.yaw
-                    objects.room[k, m] = self.houses[house_index[k]].room_index(item.x, item.y)
+                self._stand(objects, k, house_index[k], items)
         return self._draw(house_index, poses, out, appearance, keys, objects)
 
     def _draw(self, house_index, poses, out, appearance, keys, objects) -> Frames:

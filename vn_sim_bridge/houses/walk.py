@@ -60,20 +60,18 @@ class Walk:
             self.backend.dress(np.array([0]), 0, Stream.APPEARANCE, 0, self.lights)
         return True
 
-    def picture(self) -> np.ndarray:
-        """What the robot sees, [S,S,3] uint8 RGB."""
-        return np.ascontiguousarray(self.backend.observe().rgb[0].transpose(1, 2, 0))
-
-    def status(self) -> str:
-        """Where the robot is and what it looks at."""
+    def look(self) -> tuple[np.ndarray, str]:
+        """What the robot sees, [S,S,3] uint8 RGB; where it is and what it looks at."""
         frames = self.backend.observe()
+        picture = np.ascontiguousarray(frames.rgb[0].transpose(1, 2, 0))
         middle = frames.depth.shape[1] // 2
         x, y, yaw, pitch = self.backend.poses[0]
         seen = LABELS[frames.labels[0, middle, middle]].replace('_', ' ')
-        return (f'{self.house.room_at(x, y) or "doorway"}   x {x:.2f}  y {y:.2f} m  '
-                f'heading {math.degrees(yaw):.0f}  tilt {0.0 - math.degrees(pitch):.0f} deg   '
-                f'{seen} at {frames.depth[0, middle, middle]:.2f} m'
-                f'{"   touching something" if self.touched else ""}')
+        status = (f'{self.house.room_at(x, y) or "doorway"}   x {x:.2f}  y {y:.2f} m  '
+                  f'heading {math.degrees(yaw):.0f}  tilt {0.0 - math.degrees(pitch):.0f} deg   '
+                  f'{seen} at {frames.depth[0, middle, middle]:.2f} m'
+                  f'{"   touching something" if self.touched else ""}')
+        return picture, status
 
 
 def walk(house: House, randomisation: Randomisation | None = None) -> None:
@@ -103,9 +101,10 @@ def _in_window(walk: Walk, tkinter) -> None:
 
     def show():
         header = f'P6 {VIEW} {VIEW} 255 '.encode()
-        view.image = tkinter.PhotoImage(data=header + walk.picture().tobytes(), format='PPM')
+        picture, status = walk.look()
+        view.image = tkinter.PhotoImage(data=header + picture.tobytes(), format='PPM')
         view.configure(image=view.image)
-        words.configure(text=f'{walk.status()}\n{HELP}')
+        words.configure(text=f'{status}\n{HELP}')
 
     def on_key(event):
         if not walk.press(TK_ARROWS.get(event.keysym, event.char)):
@@ -130,8 +129,9 @@ def _in_terminal(house: House, randomisation: Randomisation | None) -> None:
     try:
         going = True
         while going:
-            sys.stdout.write('\x1b[H' + as_text(walk.picture(), side)
-                             + f'\x1b[0m\x1b[K{walk.status()[:columns]}\r\n\x1b[K{HELP[:columns]}')
+            picture, status = walk.look()
+            sys.stdout.write('\x1b[H' + as_text(picture, side)
+                             + f'\x1b[0m\x1b[K{status[:columns]}\r\n\x1b[K{HELP[:columns]}')
             sys.stdout.flush()
             for key in _keys(lambda: os.read(sys.stdin.fileno(), 64).decode(errors='ignore')):
                 going = going and walk.press(key)

@@ -14,7 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from vn_sim_bridge.render.rasterizer import BLOCK, LAST_NODE, NEAR, pack_scenes
+from vn_sim_bridge.render.pack import pack_scenes
+from vn_sim_bridge.render.rasterizer import BLOCK, LAST_NODE, NEAR
 from vn_sim_bridge.scene import MAX_CORNERS, Scene
 
 BAND = 16  # rows that one thread scan-converts
@@ -38,7 +39,7 @@ wp.set_module_options({'enable_backward': False, 'fast_math': False})
 
 @wp.struct
 class DevicePack:
-    """The arrays of `rasterizer.Pack` on a device."""
+    """The arrays of `pack.Pack` on a device."""
 
     vertices: wp.array2d(dtype=wp.float32)
     face_start: wp.array(dtype=wp.int32)
@@ -515,8 +516,8 @@ class WarpRenderer:
 
         Args:
             scene_index: [N] int64; cameras: [N,5] float64; focal: [N] float64 pixels.
-            cube, lamps: as in `rasterizer.Lights`.
-            object_scene, object_pose, object_room: as in `rasterizer.Objects`.
+            cube, lamps: as in `pack.Lights`.
+            object_scene, object_pose, object_room: as in `pack.Objects`.
             noise, blur, keys: [N], as in `sensor.expose`; all or none.
         """
         count, size = self.count, self.size
