@@ -1,5 +1,6 @@
 """The command line: bad input is one line, exit code 2, and nothing half-written."""
 
+import json
 import subprocess
 import sys
 
@@ -19,6 +20,13 @@ def run(*words):
 
 @pytest.mark.parametrize('words, expected', [
     (['evaluate', '/nowhere'], 'checkpoint'),
+    (['evaluate', 'models/house', '--episodes', '0'], 'episode'),
+    (['evaluate', 'models/house', '--houses', '0'], 'house'),
+    (['evaluate', 'models/house', '--split', 'moon'], 'unseen_look'),
+    (['evaluate', 'models/house', '--split', 'test', '--house', '3'], 'by seed or by split'),
+    (['evaluate', 'models/house', '--stop-threshold', '1'], 'threshold'),
+    (['evaluate', 'models/house', '--html', 'OUT/page.html'], 'folder'),
+    (['compare', '/nowhere', '--out', 'OUT'], '.html'),
     (['train', '--backend', 'thor', '--out', 'OUT'], 'backend'),
     (['train', '--rooms', '99', '--out', 'OUT'], 'rooms'),
     (['train', '--house', '-1', '--out', 'OUT'], 'seed'),
@@ -29,7 +37,7 @@ def run(*words):
 ])
 def test_bad_input_is_one_line(tmp_path, words, expected):
     out = tmp_path / 'out'
-    done = run(*[out if word == 'OUT' else word for word in words])
+    done = run(*[word.replace('OUT', str(out)) for word in words])
     assert done.returncode == 2, done.stderr
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert expected in done.stderr and 'received' in done.stderr
@@ -51,10 +59,50 @@ def test_another_world_version_is_refused_with_the_remedy(tmp_path, capsys):
 
 def test_evaluate_prints_figures(tmp_path, capsys):
     folder = write_checkpoint(tmp_path / 'model', size=36)
+    figures, page = tmp_path / 'figures.json', tmp_path / 'page.html'
     assert main(['evaluate', str(folder), '--episodes', '6', '--max-decisions', '20',
-                 '--json', str(tmp_path / 'figures.json')]) == 0
+                 '--json', str(figures), '--html', str(page)]) == 0
     assert 'shortest path' in capsys.readouterr().out
-    assert (tmp_path / 'figures.json').exists()
+    result = json.loads(figures.read_text())
+    assert list(result['splits']) == ['seen_goals'] and result['decoding'] == 'sample'
+    rows = result['splits']['seen_goals']['rows']['arrival']
+    assert len(rows) == 6 and all(row['episodes'] == 6 for row in rows.values())
+    assert page.read_text().count('<svg') == 6
+
+
+def test_evaluate_by_split_and_house(tmp_path, capsys):
+    folder = write_checkpoint(tmp_path / 'model', size=36)
+    figures = tmp_path / 'figures.json'
+    assert main(['evaluate', str(folder), '--episodes', '2', '--max-decisions', '5', '--split',
+                 'seen_goals', '--split', 'unseen_goals', '--split', 'unseen_look', '--houses',
+                 '2', '--no-controls', '--per-scene', '--json', str(figures)]) == 0
+    assert '12001' in capsys.readouterr().out
+    splits = json.loads(figures.read_text())['splits']
+    assert {name: list(map(int, split['scenes'])) for name, split in splits.items()} == {
+        'seen_goals': [7], 'unseen_goals': [7], 'unseen_look': [12_000, 12_001]}
+    starts = {split['rows']['arrival']['right goal, sample']['start_distance']
+              for split in splits.values()}
+    assert len(starts) == 3  # other goals, other houses
+
+
+def test_a_house_of_the_training_is_not_held_out(tmp_path, capsys):
+    folder = write_checkpoint(tmp_path / 'model', size=36)
+    config = json.loads((folder / CONFIG).read_text()) | {'houses': [10_001]}
+    (folder / CONFIG).write_text(json.dumps(config))
+    assert main(['evaluate', str(folder), '--split', 'validation']) == 2
+    message = capsys.readouterr().err
+    assert '10001' in message and 'not trained in' in message
+
+
+def test_a_task_without_goals_has_fewer_controls(tmp_path):
+    folder = write_checkpoint(tmp_path / 'model', size=36)
+    config = json.loads((folder / CONFIG).read_text()) | {'task': 'collect', 'objects': 4}
+    (folder / CONFIG).write_text(json.dumps(config))
+    figures = tmp_path / 'figures.json'
+    assert main(['evaluate', str(folder), '--episodes', '2', '--max-decisions', '5',
+                 '--json', str(figures)]) == 0
+    assert list(json.loads(figures.read_text())['splits']['seen_goals']['rows']['arrival']) == [
+        'right goal, sample', 'right goal, greedy', 'random actions']
 
 
 def test_house_show_writes_a_picture(tmp_path, capsys):

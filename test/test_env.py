@@ -189,7 +189,8 @@ def test_a_robot_that_sees_its_goal_pose_sees_the_goal_picture():
 
 @pytest.mark.parametrize('options', [
     {'houses': ()}, {'num_envs': 0}, {'max_decisions': 0}, {'size': 4},
-    {'privileged': ('pose',)}, {'actions': ('fly',)},
+    {'privileged': ('pose',)}, {'actions': ('fly',)}, {'stop': 'never'},
+    {'stop': 'declared', 'task': 'room'}, {'goal_variants': 0}, {'goal_seed': -1},
 ])
 def test_bad_configurations_are_refused(options):
     with pytest.raises(UserError, match='received'):
@@ -202,3 +203,178 @@ def test_bad_actions_are_refused():
     for actions in ([0, 1, 2, 9], [0, 1], [-1, 0, 0, 0]):
         with pytest.raises(UserError, match='actions are'):
             env.step(actions)
+
+
+LABELS = ('goal_pose', 'overlap')
+
+
+def test_the_goal_pose_leads_to_the_goal():
+    env = make(houses=(7, 8), num_envs=8, privileged=LABELS, goal_variants=3)
+    observation, info = env.reset(seed=0)
+    act = random_actions(env)
+    for _ in range(30):
+        x, y, c, s = info['goal_pose'].T
+        goal, pose = env.goal_poses[info['goal']], info['pose']
+        straight = np.hypot(*(goal[:, :2] - pose[:, :2]).T)
+        assert np.allclose(np.hypot(x, y), straight, atol=1e-4)
+        bearing = np.arctan2(y, x) + pose[:, 2]
+        assert np.allclose(pose[:, :2] + straight[:, None] * np.stack(
+            [np.cos(bearing), np.sin(bearing)], axis=1), goal[:, :2], atol=1e-4)
+        assert np.allclose(np.abs(np.arctan2(s, c)), info['heading_error'], atol=1e-4)
+        assert (straight <= info['distance'] + 0.05).all()
+        assert set(observation) == {'image', 'goal_index', 'last_action', 'last_reward'}
+        observation, _, _, _, info = env.step(act())
+
+
+def test_overlap_belongs_to_the_true_goal_and_a_grey_picture_has_none():
+    env = make(num_envs=16, privileged=LABELS)
+    env.set_difficulty(0.2)
+    _, right = env.reset(seed=0)
+    env.set_shown_goal('wrong')
+    _, wrong = env.reset(seed=0)
+    env.set_shown_goal('blank')
+    _, blank = env.reset(seed=0)
+    for name in LABELS:
+        assert np.array_equal(right[name], wrong[name])
+    assert np.array_equal(right['goal_pose'], blank['goal_pose'])
+    assert (right['overlap'] > 0).any() and (blank['overlap'] == 0).all()
+
+
+def test_a_robot_at_its_goal_sees_all_of_it_and_one_that_turns_away_nothing():
+    env = make(num_envs=5, privileged=LABELS, stop='declared')
+    _, info = env.reset(seed=0)
+    env.backend.place(np.arange(5), env.goal_poses[info['goal']])
+    _, reward, terminated, _, info = env.step([env.declare_action] * 5)
+    assert (info['overlap'] == 1).all() and np.allclose(info['goal_pose'], [0, 0, 1, 0], atol=1e-6)
+    assert terminated.all() and info['success'].all() and (reward == 1).all()
+    _, info = env.reset(seed=0)
+    poses = env.goal_poses[info['goal']].copy()
+    poses[:, 2] += np.pi
+    env.backend.place(np.arange(5), poses)
+    _, reward, terminated, _, info = env.step([env.declare_action] * 5)
+    assert (info['overlap'] == 0).all() and terminated.all()
+    assert not info['success'].any() and not info['arrived'].any() and (reward == 0).all()
+
+
+@pytest.mark.parametrize('task', ['object', 'room', 'collect'])
+def test_labels_exist_in_every_task(task):
+    env = make(task=task, privileged=LABELS)
+    _, info = env.reset(seed=0)
+    assert info['goal_pose'].shape == (4, 4) and info['overlap'].shape == (4,)
+    for _ in range(5):
+        _, _, _, _, info = env.step(np.zeros(4, int))
+    if task == 'collect':
+        assert (info['goal_pose'] == 0).all() and (info['overlap'] == 0).all()
+    else:
+        assert np.allclose(np.hypot(*info['goal_pose'][:, 2:].T), 1)
+    assert np.array_equal(info['arrived'], info['success'])
+
+
+def test_declared_stops_end_an_episode_and_arrivals_do_not():
+    env = make(num_envs=8, stop='declared', max_decisions=60)
+    assert env.declare_action == 4 and env.single_action_space.n == 5
+    assert env.action_names == make().action_names and make().declare_action is None
+    env.set_difficulty(0.2)
+    env.reset(seed=0)
+    passed = 0
+    for _ in range(60):
+        actions = np.minimum(env.oracle_actions(), 3)  # never declares
+        observation, reward, terminated, truncated, info = env.step(actions)
+        assert not terminated.any() and (reward == 0).all() and not info['success'].any()
+        assert np.array_equal(info['arrived'], (info['distance'] <= ARRIVAL_RADIUS) & (
+            info['heading_error'] <= ARRIVAL_HEADING))
+        passed += info['arrived'].sum()
+    assert passed > 8 and truncated.all()
+
+
+def test_a_declaration_is_judged_where_the_robot_stands():
+    env = make(num_envs=8, stop='declared', max_decisions=60)
+    env.set_difficulty(0.3)
+    observation, before = env.reset(seed=0)
+    actions = np.zeros(8, int)
+    actions[:4] = env.declare_action
+    last = observation['last_action'].copy()
+    observation, reward, terminated, truncated, info = env.step(actions)
+    assert np.array_equal(terminated, np.arange(8) < 4) and not truncated.any()
+    assert (reward == 0).all() and not info['success'].any() and (info['decisions'] == 1).all()
+    assert np.array_equal(info['pose'][:4], before['pose'][:4])
+    assert np.array_equal(observation['last_action'][:4], last[:4])
+    assert env.observation_space.contains(observation)
+    _, _, terminated, _, info = env.step(actions)  # the ended ones begin anew, whatever is asked
+    assert info['reset'][:4].all() and not terminated[:4].any()
+    ends = []
+    for _ in range(200):
+        observation, reward, terminated, truncated, info = env.step(env.oracle_actions())
+        assert env.observation_space.contains(observation)
+        assert np.array_equal(info['success'], reward == 1)
+        assert (info['success'] <= info['arrived']).all() and (info['success'] <= terminated).all()
+        ends += info['success'][terminated | truncated].tolist()
+    assert len(ends) > 20 and np.mean(ends) > 0.95
+
+
+def test_more_houses_than_environments_are_all_visited_and_resumed():
+    options = dict(houses=(1, 2, 3, 4, 5), rooms=2, num_envs=2, max_decisions=2, size=24,
+                   privileged=LABELS)
+    env, other = make(**options), make(**options)
+    env.reset(seed=1)
+    act = random_actions(env)
+    seen = [set(), set()]
+    for _ in range(90):
+        _, _, _, _, info = env.step(act())
+        for n in range(2):
+            house = int(env.house_index[n])
+            seen[n].add(house)
+            field = env.houses[house].geodesic(*env.goal_poses[info['goal'][n], :2])
+            assert info['distance'][n] == pytest.approx(
+                field.distance(info['pose'][n:n + 1, :2])[0], abs=1e-5)
+    assert seen == [{0, 2, 4}, {1, 3}]
+    other.reset(seed=9)
+    other.set_state(env.get_state())
+    for _ in range(20):
+        actions = act()
+        one, two = env.step(actions), other.step(actions)
+        for part in (0, 4):
+            for name in one[part]:
+                assert np.array_equal(one[part][name], two[part][name]), name
+        assert np.array_equal(env.house_index, other.house_index)
+
+
+def test_new_floor_pays_and_is_never_shown():
+    options = dict(num_envs=8, max_decisions=25)
+    plain, paid = make(**options), make(exploration_reward=0.5, **options)
+    _, info = plain.reset(seed=2)
+    paid.reset(seed=2)
+    other = make(exploration_reward=0.5, **options)
+    act = random_actions(plain)
+    squares = [set() for _ in range(8)]
+    origin = np.array(plain.houses[0].floor.origin)
+    total, reward, shaped = 0.0, np.zeros(8), np.zeros(8)
+    for step in range(60):
+        for n in range(8):
+            square = tuple(np.floor(info['pose'][n, :2] - origin).astype(int))
+            new, known = square not in squares[n], bool(squares[n])
+            if info['reset'][n]:
+                squares[n], known = set(), False
+            squares[n].add(square)
+            gain = shaped[n] - reward[n]
+            assert gain == pytest.approx(0.5 * (new and known)), (step, n)
+            total += gain
+        actions = np.where(act() == 1, 1, 0)
+        if step == 30:
+            other.set_state(paid.get_state())
+        one, reward, _, _, info = plain.step(actions)
+        two, shaped, *_ = paid.step(actions)
+        if step >= 30:
+            assert np.array_equal(other.step(actions)[1], shaped)
+        for name in one:
+            assert np.array_equal(one[name], two[name]), name
+    assert total > 5
+
+
+def test_other_goals_in_the_same_house():
+    own, unseen, again = make(), make(goal_seed=1), make(goal_seed=1)
+    assert np.array_equal(own.houses[0].scene.vertices, unseen.houses[0].scene.vertices)
+    assert own.goal_rooms == unseen.goal_rooms
+    assert (own.goal_poses[:, :2] != unseen.goal_poses[:, :2]).any(axis=1).all()
+    assert np.array_equal(unseen.goal_poses, again.goal_poses)
+    assert len(make(goal_variants=2).goals) == 2 * (len(own.goals) - 1) + 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import json
 import math
 import os
 import platform
@@ -14,9 +13,19 @@ from pathlib import Path
 
 from vn_nav import __version__
 from vn_nav.errors import UserError
-from vn_nav.robot import DRIVE_ACTIONS
+from vn_nav.evaluation.command import (
+    SPLIT_HOUSES,
+    add_compare_options,
+    add_evaluate_options,
+    check_evaluate_options,
+    evaluate,
+    run_compare,
+)
+from vn_nav.learning.command import add_train_options, train_config, world_options
 
 BACKENDS = ('house',)
+ENV_PRIVILEGED = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap'}
+UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -36,41 +45,18 @@ def build_parser() -> argparse.ArgumentParser:
 
     train = commands.add_parser('train', help='train a policy')
     _add_world(train)
-    train.add_argument('--task', default='image', help='image, object, room or collect')
-    train.add_argument('--objects', type=int, default=1, help='in the house at a time')
-    train.add_argument('--out', type=Path, required=True, help='folder of the run')
-    train.add_argument('--resume', action='store_true', help='go on with the run in --out')
-    train.add_argument('--frames', type=float, default=1.5e6, help='agent decisions')
-    train.add_argument('--minutes', type=float, help='stop after this wall-clock time')
-    train.add_argument('--envs', type=int, default=64)
-    train.add_argument('--actions', default=','.join(DRIVE_ACTIONS),
-                       help="names from the robot's table, with commas between")
-    train.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
-    train.add_argument('--progress-reward', type=float, default=1.0, help='per metre')
-    train.add_argument('--collision-reward', type=float, default=-0.02, help='per contact')
-    train.add_argument('--learning-rate', type=float, default=4e-4)
-    train.add_argument('--entropy', type=float, default=0.008, help='weight of the entropy')
-    train.add_argument('--curriculum', choices=('success', 'frames'), default='success',
-                       help='what raises the difficulty')
-    train.add_argument('--rollout-length', type=int, default=32)
-    train.add_argument('--epochs', type=int, default=2)
-    train.add_argument('--minibatches', type=int, default=4)
-    train.add_argument('--channels', type=int, nargs=3, default=(16, 32, 64),
-                       help='of the three convolutions')
-    train.add_argument('--no-tensorboard', action='store_true')
-    train.add_argument('--no-bf16', action='store_true', help='float32 throughout')
-    train.add_argument('--threads', type=int, default=1)
+    add_train_options(train)
     train.set_defaults(run=run_train)
 
-    evaluate = commands.add_parser('evaluate', help='measure a checkpoint')
-    evaluate.add_argument('checkpoint', type=Path)
-    _add_world(evaluate, defaults=False)
-    evaluate.add_argument('--episodes', type=int, default=100)
-    evaluate.add_argument('--max-decisions', type=int, default=300)
-    evaluate.add_argument('--decoding', choices=('sample', 'greedy'))
-    evaluate.add_argument('--no-controls', action='store_true')
-    evaluate.add_argument('--json', type=Path, help='also write the figures here')
-    evaluate.set_defaults(run=run_evaluate)
+    measured = commands.add_parser('evaluate', help='measure a checkpoint')
+    measured.add_argument('checkpoint', type=Path)
+    _add_world(measured, defaults=False)
+    add_evaluate_options(measured)
+    measured.set_defaults(run=run_evaluate)
+
+    compare = commands.add_parser('compare', help="plot several runs' learning curves")
+    add_compare_options(compare)
+    compare.set_defaults(run=run_compare)
 
     publish = commands.add_parser(
         'publish', help='measure a run and write it as a checkpoint to ship')
@@ -131,33 +117,52 @@ def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, thread
 def run_train(args) -> int:
     """`vn_nav train`."""
     _check_backend(args.backend)
-    from vn_nav.learning.trainer import TrainConfig, train
-    houses = args.house or [0]
-    env = make_env(houses, args.rooms, args.envs, robot=args.robot, threads=args.threads,
+    from vn_nav.learning.trainer import train
+    from vn_sim_bridge.houses.splits import SPLITS
+    if args.house and args.houses:
+        raise UserError('a training is in named houses or in the first N', '--house and --houses',
+                        'give one of them')
+    houses = args.house or list(SPLITS['train'][:args.houses or 1])
+    config, world = train_config(args), world_options(args)
+    env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
                    randomisation=args.randomisation, size=args.size, seed=args.seed,
                    actions=tuple(args.actions.split(',')), task=args.task,
-                   objects=args.objects,
-                   progress_reward=args.progress_reward, collision_reward=args.collision_reward)
-    config = TrainConfig(
-        frames=int(args.frames), minutes=args.minutes, rollout_length=args.rollout_length,
-        curriculum=args.curriculum, epochs=args.epochs, minibatches=args.minibatches,
-        channels=tuple(args.channels),
-        learning_rate=args.learning_rate, final_learning_rate=args.learning_rate / 10,
-        entropy_coefficient=args.entropy, final_entropy_coefficient=args.entropy / 3,
-        seed=args.seed, bf16=False if args.no_bf16 else None, threads=args.threads,
-        tensorboard=not args.no_tensorboard)
+                   objects=args.objects, goals_per_room=args.goals_per_room,
+                   goal_variants=args.goal_variants,
+                   privileged=tuple(sorted(set(config.privileged) & ENV_PRIVILEGED)), **world)
     words = [word for word in sys.argv[1:] if word != '--resume']
     info = {
         'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
-        'task': args.task, 'objects': args.objects, 'command': 'vn_nav ' + shlex.join(words),
+        'goals_per_room': args.goals_per_room, 'goal_variants': args.goal_variants,
+        'task': args.task, 'objects': args.objects, 'preset': args.preset,
+        'command': 'vn_nav ' + shlex.join(words),
         'camera_fov_deg': math.degrees(env.robot.camera_fov),
         'camera_height': env.robot.camera_height,
-        'notes': f'Trained on {machine()}, {args.threads} thread(s), '
+        'notes': f'Trained on {machine()}, {config.threads} thread(s), '
                  f'{datetime.date.today().isoformat()}.',
         'world_version': env.world_version,
     }
-    print(train(env, config, args.out, info=info, resume=args.resume))
+    pairs = None
+    if config.pair_minutes and not args.init:
+        pairs = _pair_sources(args, config)
+    print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
+                pairs=pairs))
     return 0
+
+
+def _pair_sources(args, config):
+    """Makes the pairs that a training begins with, and those of validation houses."""
+    def make():
+        from vn_nav.robot import load_robot
+        from vn_sim_bridge.houses.splits import SPLITS
+        from vn_sim_bridge.pairs import PairSampler
+        from vn_sim_bridge.randomisation import load_randomisation
+        options = {'rooms': args.rooms, 'size': args.size, 'threads': config.threads,
+                   'robot': load_robot(args.robot) if args.robot else None,
+                   'randomisation': load_randomisation(args.randomisation)}
+        return (PairSampler(SPLITS['train'][:config.pair_houses], seed=args.seed, **options),
+                PairSampler(SPLITS['validation'][:16], seed=args.seed + 1, **options))
+    return make
 
 
 def machine() -> str:
@@ -193,61 +198,96 @@ def _load(path: Path, robot: Path | None = None):
 
 
 def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, controls: bool = True,
-            decoding: str | None = None, max_decisions: int = 300,
-            robot: Path | None = None, randomisation: str | None = None) -> dict:
-    """Figures of a loaded checkpoint in some houses."""
-    from vn_nav.evaluation.evaluator import evaluate
-    env = make_env(houses, rooms, min(50, episodes), robot=robot, size=checkpoint.config.size,
-                   randomisation=randomisation or checkpoint.info['randomisation'],
-                   task=checkpoint.info['task'], objects=checkpoint.info['objects'],
-                   actions=checkpoint.config.actions, max_decisions=max_decisions)
-    return evaluate(env, checkpoint.network, decoding=decoding or checkpoint.info['decoding'],
-                    episodes=episodes, controls=controls, seed=seed)
+            decoding: str | None = None, threshold: float | None = None, max_decisions: int = 300,
+            robot: Path | None = None, randomisation: str | None = None, goal_seed: int = 0):
+    """Episodes of a loaded checkpoint in some houses.
+
+    Returns:
+        The episodes as `evaluator.measure` returns them, and the houses' floor plans by seed.
+    """
+    from vn_nav.evaluation import evaluator
+    from vn_nav.robot import load_robot
+    info, plans = checkpoint.info, {}
+    own = set(houses) <= set(info['houses'])
+
+    def make(seeds, environments: int, stop: str):
+        env = make_env(seeds, rooms, environments, robot=robot, size=checkpoint.config.size,
+                       randomisation=randomisation or info['randomisation'], task=info['task'],
+                       objects=info['objects'], actions=checkpoint.config.actions,
+                       max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
+                       goals_per_room=info['goals_per_room'] if own else 1)
+        plans.update({house.seed: _floor_plan(house) for house in env.houses})
+        return env
+
+    wanted = evaluator.CONTROLS if controls else ()
+    if info['task'] == 'collect':  # no goal: none to show wrong, and no shortest path to it
+        wanted = [name for name in wanted if name in (evaluator.OTHER, evaluator.RANDOM)]
+    rows = evaluator.measure(
+        make, checkpoint.network, houses, decoding=decoding or info['decoding'],
+        episodes=episodes, controls=wanted, seed=seed,
+        threshold=info.get('stop_threshold') if threshold is None else threshold,
+        robot=load_robot(robot) if robot else None)
+    return rows, plans
+
+
+def _floor_plan(house) -> dict:
+    """What a map needs of a house, as on the bridge's topic `scene`."""
+    return {
+        'house': house.seed, 'bounds': list(house.outline), 'area': house.area,
+        'rooms_list': [{'name': room.name, 'rect': list(room.rect)} for room in house.rooms],
+        'walls': [list(o.rect) for o in house.obstacles if o.label == 'wall'],
+        'obstacles': [[*o.rect, o.label] for o in house.obstacles
+                      if o.label not in ('wall', 'outside')],
+        'outside': [list(o.rect) for o in house.obstacles if o.label == 'outside'],
+        'goals': [{'room': goal.room, 'pose': list(goal.pose)} for goal in house.goals],
+    }
+
+
+def _splits(args, info: dict) -> dict[str, list[int]]:
+    """The houses of each split that is asked for."""
+    from vn_sim_bridge.houses.splits import SPLITS
+    if args.house:
+        return {'houses': list(dict.fromkeys(args.house))}
+    found = {}
+    for name in args.split or ['seen_goals']:
+        if name in ('seen_goals', 'unseen_goals'):
+            found[name] = info['houses'][:args.houses]
+            if not found[name]:
+                raise UserError('seen and unseen goals are in the houses of the checkpoint',
+                                'a checkpoint that names none', 'give --house or another --split')
+        elif name in SPLITS:
+            found[name] = list(SPLITS[name][:args.houses or SPLIT_HOUSES])
+            known = sorted(set(found[name]) & set(info['houses']))
+            if name != 'train' and known:
+                raise UserError(f'the checkpoint was not trained in houses of split {name}',
+                                f'house {known[0]}', 'choose another split')
+        else:
+            raise UserError(f'a split is one of {", ".join(SPLITS)}, seen_goals, unseen_goals',
+                            name, 'choose one of them')
+    return found
 
 
 def run_evaluate(args) -> int:
     """`vn_nav evaluate`."""
     _check_backend(args.backend)
-    if args.episodes < 1:
-        raise UserError('there is at least one episode', args.episodes, 'raise --episodes')
+    check_evaluate_options(args)
     checkpoint = _load(args.checkpoint, args.robot)
-    houses = args.house or checkpoint.info['houses']
-    rooms = args.rooms or checkpoint.info['rooms']
-    results = measure(checkpoint, houses, rooms, episodes=args.episodes, seed=args.seed,
-                      controls=not args.no_controls, decoding=args.decoding,
-                      max_decisions=args.max_decisions, robot=args.robot,
-                      randomisation=args.randomisation)
-    show_results(results, f'{args.checkpoint} in house {", ".join(map(str, houses))}, '
-                          f'{args.max_decisions} decisions at most')
-    if args.json:
-        args.json.write_text(json.dumps(results, indent=2))
+
+    def measure_split(name: str, houses):
+        return measure(
+            checkpoint, houses, args.rooms or checkpoint.info['rooms'], episodes=args.episodes,
+            seed=args.seed, controls=not args.no_controls, decoding=args.decoding,
+            threshold=args.stop_threshold, max_decisions=args.max_decisions, robot=args.robot,
+            randomisation=args.randomisation,
+            goal_seed=UNSEEN_GOALS if name == 'unseen_goals' else 0)
+
+    evaluate(args, checkpoint.info, _splits(args, checkpoint.info), measure_split)
     return 0
-
-
-def show_results(results: dict, title: str) -> None:
-    """Print figures as a table."""
-    from rich.console import Console
-    from rich.table import Table
-    count = next(iter(results.values()))['episodes']
-    table = Table(title=f'{title}, {count} episodes each')
-    for heading in ('policy', 'success (95 %)', 'SPL', 'decisions', 'seconds', 'collisions',
-                    'contact-free', 'stop error'):
-        table.add_column(heading, justify='left' if heading == 'policy' else 'right',
-                         no_wrap=True)
-    for name, r in results.items():
-        low, high = r['success_interval']
-        table.add_row(name, f'{r["success"]:.2f} ({low:.2f}-{high:.2f})',
-                      f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["seconds"]:.0f}',
-                      f'{r["collisions"]:.1%}', f'{r["contact_free_success"]:.2f}',
-                      f'{r["stop_error_m"]:.2f} m {r["stop_error_deg"]:.0f} deg')
-    console = Console()
-    if not console.is_terminal:
-        console.width = 120  # a file or a pipe has no width of its own
-    console.print(table)
 
 
 def run_publish(args) -> int:
     """`vn_nav publish`."""
+    from vn_nav.evaluation import evaluator, tables
     from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
     checkpoint = _load(args.source, args.robot)
     info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
@@ -257,10 +297,14 @@ def run_publish(args) -> int:
     info['results'] = {}
     for place, seeds in (('trained house', houses), (f'unseen house {args.unseen}',
                                                      [args.unseen])):
-        results = measure(shipped, seeds, rooms, episodes=args.episodes, seed=10_000,
+        rows, _ = measure(shipped, seeds, rooms, episodes=args.episodes, seed=10_000,
                           robot=args.robot)
-        show_results(results, place)
-        info['results'] |= {f'{place}: {name}': figures for name, figures in results.items()}
+        results = evaluator.figures(rows)
+        tables.print_rows(results, place)
+        for stop, row in results.items():
+            kind = '' if stop == evaluator.ARRIVAL else 'declared stop, '
+            info['results'] |= {f'{place}: {kind}{name}': figures
+                                for name, figures in row.items()}
     info['notes'] += (f' Measured with `vn_nav publish`, {args.episodes} episodes a row, 300 '
                       f'decisions at most, motion noise on, on {machine()}, '
                       f'{datetime.date.today().isoformat()}. Figures are defined in '

@@ -29,6 +29,10 @@ class Stream(enum.IntEnum):
     LATE_PICTURE = 12
     OBJECT_PLACE = 13
     OBJECT_KIND = 14
+    HOUSE = 15  # of an episode
+    PAIR = 16  # poses of two views
+    PAIR_APPEARANCE = 17
+    PAIR_SENSOR = 18
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

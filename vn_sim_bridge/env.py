@@ -20,19 +20,28 @@ from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.houses.house import CELL, interpolate
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS
 from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.overlap import GRID, lift, overlap, relative_pose
 from vn_sim_bridge.randomisation import Randomisation
 from vn_sim_bridge.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.world import motion_noise
 
 TASKS = ('image', 'object', 'room', 'collect')
-PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action')
+PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
+              'overlap')
+STOPS = ('arrival', 'declared')
 TURN_COST = 0.05  # m, what the shortest-path action charges for one rotation
 BLOCKED_COST = 1.0  # per metre that a contact cuts off a forward move
+SQUARE = 1.0  # m, side of the squares of floor that exploration counts
+BATCH = 256  # goal pictures drawn at a time: few need little memory
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """What a `NavigationEnv` simulates. Environment i lives in house i modulo their number."""
+    """What a `NavigationEnv` simulates.
+
+    Environment i lives in house i modulo their number. With more houses than environments it draws
+    one of the houses i, i + N, i + 2 N, ... for every episode.
+    """
 
     houses: tuple[int, ...] = (0,)  # seeds
     rooms: int = 5  # of each house
@@ -52,6 +61,10 @@ class EnvConfig:
     room_must_see: bool = False  # the room rule of House3D's code, see tasks.RoomGoal
     randomisation: Randomisation = Randomisation()
     privileged: tuple[str, ...] = ()  # of PRIVILEGED
+    stop: str = 'arrival'  # of STOPS: an episode ends on arrival, or when the robot says so
+    goal_variants: int | None = None  # pictures of each goal; default: the randomisation's
+    goal_seed: int = 0  # 0: the houses' own goals, else other ones in the same houses
+    exploration_reward: float = 0.0  # per square of floor that is new to the episode, see SQUARE
 
     def __post_init__(self):
         rules = (
@@ -63,10 +76,21 @@ class EnvConfig:
             (1 <= self.objects <= 16, 'there are 1 to 16 objects', self.objects),
             (set(self.privileged) <= set(PRIVILEGED),
              f'privileged outputs are some of {", ".join(PRIVILEGED)}', self.privileged),
+            (self.stop in STOPS, f'the stop is one of {", ".join(STOPS)}', self.stop),
+            (self.stop == 'arrival' or self.task == 'image',
+             'only the image task ends when the robot declares that it has arrived', self.task),
+            (self.goal_variants is None or 1 <= self.goal_variants <= 256,
+             'a goal has 1 to 256 pictures', self.goal_variants),
+            (self.goal_seed >= 0, 'the seed of goals is not negative', self.goal_seed),
         )
         for kept, rule, received in rules:
             if not kept:
                 raise UserError(rule, received, 'correct the environment configuration')
+
+    @property
+    def pictures_per_goal(self) -> int:
+        """Differently lit pictures kept of each goal."""
+        return self.goal_variants or self.randomisation.pictures_per_goal
 
 
 class NavigationEnv(gymnasium.vector.VectorEnv):
@@ -79,6 +103,17 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     Autoreset is NEXT_STEP: the step after an episode's end ignores its action and returns the new
     episode's first observation with reward 0; `info['reset']` marks these rows: no frames.
+
+    With `stop='declared'` arriving ends no episode. `step` then takes one more number,
+    `declare_action`, which says "I have arrived": the robot stays where it is and the episode
+    ends, a success if it is true. It counts as a decision; `last_action` never shows it.
+    `info['arrived']` tells at the end of every decision whether it would be true.
+
+    `config.privileged` adds to `info`, beside pictures and the shortest path's action:
+    `goal_pose` [N,4] float32, the true goal's camera as the robot sees it (see
+    `overlap.relative_pose`), and `overlap` [N] float32, the share of what the true goal's picture
+    shows that the robot's picture shows too (see `overlap.overlap`; 0 for a blank goal). Without a
+    view to go to both are zeros.
 
     Args:
         config: what to simulate.
@@ -94,17 +129,19 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs = n = config.num_envs
         self.houses = [generate_house(seed, rooms=config.rooms,
-                                      goals_per_room=config.goals_per_room)
+                                      goals_per_room=config.goals_per_room,
+                                      goal_seed=config.goal_seed)
                        for seed in config.houses]
-        self.house_index = np.arange(n) % len(self.houses)
+        self._wanders = len(self.houses) > n and not config.one_goal_per_env
         self._seed = config.seed
         self.task = self._make_task()
         self.backend = HouseBackend(
-            self.houses, self.house_index, robot=self.robot, size=config.size, threads=threads,
-            randomisation=config.randomisation, models=self.task.models,
+            self.houses, np.arange(n) % len(self.houses), robot=self.robot, size=config.size,
+            threads=threads, randomisation=config.randomisation, models=self.task.models,
             objects=self.task.objects)
         self.world_version = self.backend.world_version
         self.action_names = self.robot.action_names
+        self.declare_action = len(self.action_names) if config.stop == 'declared' else None
         self._deltas = np.array([[a.dx, a.dy, a.dyaw, a.dpitch] for a in self.robot.actions])
         self._sizes = np.array([abs(action.size) for action in self.robot.actions])
         self._make_goals()
@@ -116,6 +153,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._goal = np.zeros(n, np.int64)  # index of the view that names the true goal
         self._goal_yaw = np.zeros(n)
         self._shown_goal = np.zeros(n, np.int64)
+        self._picture = np.zeros(n, np.int64)  # of the true goal
         self._distance = np.zeros(n)
         self._start_distance = np.zeros(n)
         self._path_length = np.zeros(n)
@@ -128,7 +166,18 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         shapes = [house.floor.free.shape for house in self.houses]
         self._maps = np.full((n, max(s[0] for s in shapes), max(s[1] for s in shapes)), np.inf,
                              np.float32)
-        self._origins = np.array([self.houses[h].floor.origin for h in self.house_index])
+        self._origins = np.array([house.floor.origin for house in self.houses])
+        rows, columns = (math.ceil(side * CELL / SQUARE) for side in self._maps.shape[1:])
+        self._visited = np.zeros((n, rows, columns), bool)
+        # Options that are off add nothing to the state.
+        used = {'_visited': config.exploration_reward,
+                '_picture': set(config.privileged) & {'goal_pose', 'overlap'}}
+        self._state = (*self._STATE, *(name for name in used if used[name]))
+
+    @property
+    def house_index(self) -> np.ndarray:
+        """[N] the house of each robot."""
+        return self.backend.world.house_index
 
     def _make_task(self) -> tasks.Task:
         config, common = self.config, (self.houses, self.config.num_envs)
@@ -139,7 +188,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if config.task == 'object':
             return tasks.ObjectGoal(
                 *common, models=GOAL_OBJECTS, objects=config.objects,
-                pictures=max(4, config.randomisation.pictures_per_goal), min_distance=distance,
+                pictures=max(4, config.pictures_per_goal), min_distance=distance,
                 seed=config.seed)
         if config.task == 'room':
             return tasks.RoomGoal(*common, must_see=config.room_must_see, min_distance=distance)
@@ -150,21 +199,27 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         views = self.task.views
         self.goal_poses = np.array([view.pose for view in views]).reshape(-1, 4)
         self.goal_rooms = (*(view.name for view in views), 'nothing')
-        self._variants = variants = self.config.randomisation.pictures_per_goal
-        size, count = self.config.size, len(views)
-        view = np.repeat(np.arange(count), variants)
-        variant = np.tile(np.arange(variants), count)
-        rgb = np.full((count * variants + 1, 3, size, size), 128, np.uint8)
-        self.goal_segmentation = np.zeros((count * variants + 1, size, size), np.uint8)
-        if count:
+        self._variants = self.config.pictures_per_goal
+        size, count = self.config.size, len(views) * self._variants
+        self.goals = np.full((count + 1, 3, size, size), 128, np.uint8)
+        self.goal_segmentation = np.zeros((count + 1, size, size), np.uint8)
+        self.blank_goal = count
+        wanted = 'overlap' in self.config.privileged
+        self._goal_points = np.full((count + 1 if wanted else 0, GRID * GRID, 3), np.nan,
+                                    np.float32)
+        for first in range(0, count, BATCH):
+            part = slice(first, min(first + BATCH, count))
+            view, variant = np.divmod(np.arange(part.start, part.stop), self._variants)
+            poses = self.goal_poses[view]
+            appearance = self.backend.appearance(self._seed, Stream.GOAL_APPEARANCE, view, variant)
             frames = self.backend.view(
-                np.array([views[k].house for k in view]), self.goal_poses[view], None,
-                self.backend.appearance(self._seed, Stream.GOAL_APPEARANCE, view, variant),
+                np.array([views[k].house for k in view]), poses, None, appearance,
                 key(self._seed, Stream.GOAL_APPEARANCE, view, variant, 99),
                 [views[k].objects for k in view])
-            rgb[:-1], self.goal_segmentation[:-1] = frames.rgb, frames.labels
-        self.goals = rgb
-        self.blank_goal = count * variants
+            self.goals[part], self.goal_segmentation[part] = frames.rgb, frames.labels
+            if wanted:
+                self._goal_points[part] = lift(frames.depth,
+                                               *self.backend.cameras(poses, appearance))
 
     def _make_spaces(self) -> None:
         size, actions = self.config.size, len(self.action_names)
@@ -174,9 +229,14 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'last_action': spaces.Discrete(actions + 1, start=-1),
             'last_reward': spaces.Box(-np.inf, np.inf, (), np.float32),
         })
-        self.single_action_space = spaces.Discrete(actions)
+        self.single_action_space = spaces.Discrete(self._choices)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def _choices(self) -> int:
+        """Numbers that `step` takes."""
+        return len(self.action_names) + (self.declare_action is not None)
 
     # The two switches that training and evaluation turn.
 
@@ -202,8 +262,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that changes from step to step; with equal switches `set_state` goes on."""
         objects = self.backend.objects
-        return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed),
-                **{name.strip('_'): getattr(self, name).copy() for name in self._STATE},
+        houses = {'house_index': self.house_index.copy()} if self._wanders else {}
+        return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed), **houses,
+                **{name.strip('_'): getattr(self, name).copy() for name in self._state},
                 **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
                 **{f'task_{name}': part.copy() for name, part in self.task.state.items()}}
 
@@ -211,8 +272,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """Stand where `get_state` was taken."""
         self._seed = int(state['seed'])
         everyone = np.arange(self.num_envs)
+        if self._wanders:
+            self.backend.enter(everyone, state['house_index'])
         self.backend.place(everyone, state['poses'])
-        for name in self._STATE:
+        for name in self._state:
             getattr(self, name)[:] = state[name.strip('_')]
         for name, part in self.backend.objects._asdict().items():
             part[:] = state[f'objects_{name}']
@@ -234,16 +297,17 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """One decision in every environment that is not being reset."""
         actions = np.asarray(actions, np.int64)
         if actions.shape != (self.num_envs,) or actions.min() < 0 or (
-                actions.max() >= len(self.action_names)):
+                actions.max() >= self._choices):
             raise UserError(f'actions are {self.num_envs} integers from 0 to '
-                            f'{len(self.action_names) - 1}', actions.tolist(),
+                            f'{self._choices - 1}', actions.tolist(),
                             'pass such an array')
         reset = self._done.copy()
-        acting = np.nonzero(~reset)[0]
+        declared = ~reset & (actions == len(self.action_names))
+        acting, driving = np.nonzero(~reset)[0], np.nonzero(~reset & ~declared)[0]
         collided = np.zeros(self.num_envs, bool)
         before = self._distance.copy()
-        if len(acting):
-            collided[acting] = self._drive(actions[acting], acting)
+        if len(driving):
+            collided[driving] = self._drive(actions[driving], driving)
         if reset.any():
             self._begin(np.nonzero(reset)[0])
         self._measure(acting)
@@ -252,14 +316,17 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         objects = self.backend.objects
         verdict = self.task.judge(tasks.Situation(
             ~reset, self._distance, self._heading_error(), self.backend.poses, frames.labels,
-            self.backend.object_models(), objects.pose[:, :, :2]))
+            self.backend.object_models(), objects.pose[:, :, :2],
+            None if self.declare_action is None else declared))
         objects.scene[verdict.removed] = -1
         reward = np.where(reset, 0, verdict.reward + tasks.shaping_reward(
             before, self._distance, collided, progress=self.config.progress_reward,
             collision=self.config.collision_reward)).astype(np.float32)
-        self._last_action[acting] = actions[acting]
+        if self.config.exploration_reward:
+            reward[acting] += self.config.exploration_reward * self._explore(acting)
+        self._last_action[driving] = actions[driving]
         self._last_reward[acting] = verdict.reward[acting]
-        terminated = verdict.success
+        terminated = verdict.success | declared
         truncated = ~terminated & ~reset & (self._step >= self.config.max_decisions)
         self._done = terminated | truncated
         observation, info = self._result(frames, reset, verdict.success, collided)
@@ -292,6 +359,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def _begin(self, env_ids: np.ndarray) -> None:
         """Draw goal, start, light and base of new episodes."""
         self._episode[env_ids] += 1
+        if self._wanders:
+            own = (len(self.houses) - 1 - env_ids) // self.num_envs + 1  # n, n + N, n + 2 N, ...
+            turn = own * uniform(self._seed, Stream.HOUSE, env_ids, self._episode[env_ids])
+            self.backend.enter(env_ids, env_ids + turn.astype(np.int64) * self.num_envs)
         for n in env_ids:
             counter = (self._seed, int(n), int(self._episode[n]))
             episode = self.task.begin(int(n), int(self.house_index[n]), counter, self._tau,
@@ -301,6 +372,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             self._goal[n], self._goal_yaw[n] = episode.goal, episode.goal_yaw
             self._shown_goal[n] = (self.blank_goal if episode.shown < 0
                                    else episode.shown * self._variants + variant)
+            true = episode.shown if self._mode == RIGHT else episode.goal
+            self._picture[n] = true * self._variants + variant
             self.backend.place(np.array([n]), episode.start[None])
             self.backend.set_objects(n, episode.objects)
             self._maps[n] = np.inf
@@ -318,6 +391,17 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._last_reward[env_ids] = 0.0
         self._measure(env_ids)
         self._start_distance[env_ids] = self._distance[env_ids]
+        if self.config.exploration_reward:
+            self._visited[env_ids] = False
+            self._explore(env_ids)
+
+    def _explore(self, env_ids: np.ndarray) -> np.ndarray:
+        """Which robots stand on a square of floor that is new to their episodes, [K] bool."""
+        at = (self.backend.poses[env_ids, :2] - self._origins[self.house_index[env_ids]]) / SQUARE
+        column, row = at.astype(np.int64).T
+        new = ~self._visited[env_ids, row, column]
+        self._visited[env_ids, row, column] = True
+        return new
 
     def _measure(self, env_ids: np.ndarray) -> None:
         """Geodesic distance of robots to their goals; 0 where the task has none."""
@@ -325,7 +409,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             self._distance[env_ids] = self._distance_of(env_ids, self.backend.poses[env_ids, :2])
 
     def _distance_of(self, env_ids: np.ndarray, xy: np.ndarray) -> np.ndarray:
-        cells = (xy - self._origins[env_ids]) / CELL - 0.5
+        cells = (xy - self._origins[self.house_index[env_ids]]) / CELL - 0.5
         return interpolate(self._maps, np.asarray(env_ids), cells[:, 0], cells[:, 1])
 
     def _heading_error(self) -> np.ndarray:
@@ -353,6 +437,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         info = {
             'reset': reset,
             'success': success,
+            'arrived': (tasks.arrived(self._distance, self._heading_error())
+                        if self.config.task == 'image' else success.copy()),
             'collided': collided,
             'distance': self._distance.astype(np.float32),
             'heading_error': self._heading_error().astype(np.float32),
@@ -370,14 +456,30 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             info['goal_segmentation'] = self.goal_segmentation[self._shown_goal]
         if 'oracle_action' in self.config.privileged:
             info['oracle_action'] = self.oracle_actions()
+        if 'goal_pose' in self.config.privileged:
+            info['goal_pose'] = self._goal_pose()
+        if 'overlap' in self.config.privileged:
+            info['overlap'] = self._overlap(frames.depth)
         return observation, info
+
+    def _goal_pose(self) -> np.ndarray:
+        if not self.task.views:
+            return np.zeros((self.num_envs, 4), np.float32)
+        return relative_pose(self.backend.poses, self.goal_poses[self._picture // self._variants])
+
+    def _overlap(self, depth: np.ndarray) -> np.ndarray:
+        if not self.task.views:
+            return np.zeros(self.num_envs, np.float32)
+        # The grey picture has no points.
+        picture = np.where(self._shown_goal == self.blank_goal, self.blank_goal, self._picture)
+        return overlap(self._goal_points[picture], depth, *self.backend.cameras())
 
     def oracle_actions(self) -> np.ndarray:
         """The next action [N] on a shortest path to the goal, from the simulator's geometry.
 
         Far from the goal: the heading, among those that rotations reach, whose forward move comes
         closest to the goal, charging `TURN_COST` a rotation and `BLOCKED_COST` for contacts.
-        At the goal: turn to its yaw.
+        At the goal: turn to its yaw; having arrived, declare it where that ends an episode.
         """
         if self.config.task == 'collect':
             raise UserError('the shortest-path action needs a task with a goal', 'collect',
@@ -392,7 +494,11 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         half = math.ceil(math.pi / turn)
         turns = np.arange(-half + 1, half + 1)
         actions = np.empty(self.num_envs, np.int64)
+        there = tasks.arrived(self._distance, self._heading_error())
         for n in range(self.num_envs):
+            if self.declare_action is not None and there[n]:
+                actions[n] = self.declare_action
+                continue
             yaw = self.backend.poses[n, 2]
             if self.config.task == 'image' and self._distance[n] <= tasks.ARRIVAL_RADIUS:
                 wanted = tasks.wrap_angle(self._goal_yaw[n] - yaw)

@@ -52,6 +52,7 @@ _variant_stream = wp.constant(int(Stream.GOAL_VARIANT))
 _sensor_stream = wp.constant(int(Stream.SENSOR))
 _base_stream = wp.constant(int(Stream.BASE))
 _slip_stream = wp.constant(int(Stream.SLIP))
+_house_stream = wp.constant(int(Stream.HOUSE))
 _facing = wp.constant(wp.types.vector(6, wp.float64)(*map(float, FACING)))
 _translation_noise = wp.constant(wp.float64(TRANSLATION_NOISE))
 _rotation_noise = wp.constant(wp.float64(ROTATION_NOISE))
@@ -117,6 +118,8 @@ class Rules:
     seed: wp.int64
     mode: wp.int32  # see MODES
     variants: wp.int32
+    environments: wp.int32
+    houses: wp.int32
     blank_goal: wp.int64
     tau: wp.float64
     max_decisions: wp.int64
@@ -299,6 +302,10 @@ def begin(houses: Houses, robots: Robots, rules: Rules, n: int):
     """A new episode, as `NavigationEnv._begin` with `tasks.ImageGoal`."""
     robots.episode[n] = robots.episode[n] + wp.int64(1)
     env, episode, zero = wp.int64(n), robots.episode[n], wp.int64(0)
+    if rules.houses > rules.environments:  # one of the houses n, n + N, n + 2 N, ...
+        own = (rules.houses - 1 - n) // rules.environments + 1
+        turn = wp.int32(uniform(rules.seed, _house_stream, env, episode, zero) * _f(own))
+        robots.house[n] = wp.int64(n + turn * rules.environments)
     house = wp.int32(robots.house[n])
     first = houses.first_goal[house]
     count = houses.first_goal[house + 1] - first
@@ -453,6 +460,12 @@ class WarpNavigationEnv:
         if config.task != 'image' or config.one_goal_per_env:
             raise UserError('the device runs the image task with goals drawn each episode',
                             config.task, 'use NavigationEnv')
+        if config.stop != 'arrival' or config.exploration_reward:
+            raise UserError('on the device episodes end on arrival, and new floor pays nothing',
+                            (config.stop, config.exploration_reward), 'use NavigationEnv')
+        if unknown := sorted(set(config.privileged) & {'goal_pose', 'overlap'}):
+            raise UserError('the device knows no goal_pose and no overlap', ', '.join(unknown),
+                            'use NavigationEnv')
         if config.randomisation.late_picture:
             raise UserError('pictures are never late on the device',
                             config.randomisation.late_picture, 'use NavigationEnv')
@@ -460,7 +473,8 @@ class WarpNavigationEnv:
         self.num_envs, self.device = config.num_envs, device
         self.world_version, self.action_names = WORLD_VERSION, self.robot.action_names
         self.houses = [generate_house(seed, rooms=config.rooms,
-                                      goals_per_room=config.goals_per_room)
+                                      goals_per_room=config.goals_per_room,
+                                      goal_seed=config.goal_seed)
                        for seed in config.houses]
         if self.robot.footprint_radius > min(h.footprint_radius for h in self.houses):
             raise UserError('the robot fits into the floor map of the house',
@@ -484,7 +498,7 @@ class WarpNavigationEnv:
         return wp.array(np.ascontiguousarray(values, dtype), device=self.device)
 
     def _upload_houses(self, task: tasks.ImageGoal) -> Houses:
-        fields = task.goal_fields
+        fields = list(map(task.goal_field, range(len(task.views))))
         shapes = [entry.field.values.shape for entry in fields]
         maps = np.full((len(fields), max(s[0] for s in shapes), max(s[1] for s in shapes)), np.inf,
                        np.float32)
@@ -509,7 +523,8 @@ class WarpNavigationEnv:
         config, varied, robot = self.config, self.config.randomisation, self.robot
         rules = Rules()
         rules.seed, rules.mode, rules.tau = config.seed, 0, 1.0
-        rules.variants = varied.pictures_per_goal
+        rules.variants = config.pictures_per_goal
+        rules.environments, rules.houses = self.num_envs, len(self.houses)
         rules.blank_goal = len(self.goal_poses) * rules.variants
         rules.max_decisions = config.max_decisions
         rules.motion_noise = int(config.noise)

@@ -31,7 +31,7 @@ class World:
     """
 
     def __init__(self, houses: list[House], house_index: np.ndarray, radius: float):
-        self.house_index = np.asarray(house_index, np.int64)
+        self.house_index = np.array(house_index, np.int64)
         self.radius = radius
         self.poses = np.zeros((len(self.house_index), 4))  # x, y, yaw, pitch
         self._rects = np.concatenate([house.obstacle_rects for house in houses])

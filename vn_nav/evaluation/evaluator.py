@@ -1,8 +1,8 @@
-"""Measures a policy in a vector environment, beside random actions and the shortest path."""
+"""Measures a policy in vector environments, beside random actions and the shortest path."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -12,6 +12,14 @@ from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.robot import RobotSpec
 
 Actor = Callable[[dict, np.ndarray], np.ndarray]  # (observation, reset [N]) -> actions [N]
+Rows = dict[str, dict[str, list[Episode]]]  # 'arrival' or 'declared', then a row's name
+ARRIVAL, DECLARED = 'arrival', 'declared'  # what ends an episode before its limit
+OTHER, WRONG, BLANK, RANDOM, SHORTEST = (
+    'other decoding', 'wrong goal', 'blank goal', 'random actions', 'shortest path')
+CONTROLS = (OTHER, WRONG, BLANK, RANDOM, SHORTEST)
+STOP_THRESHOLD = 0.5  # of the arrival head's probability, where nobody chose another
+HOUSES_AT_ONCE = 16  # in memory
+ENVIRONMENTS = 50  # at most at once, unless there are more houses
 
 
 def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpec
@@ -24,14 +32,21 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
         episodes: at least this many; rounded up to the same number in each environment.
         seed: of the environment: equal seeds give equal starts.
         robot: for the duration of actions at its default limits.
+
+    Returns:
+        Environment by environment, each in the order of time.
     """
     count = env.num_envs
     each = -(-episodes // count)
-    durations = np.array([robot.with_actions(env.action_names).nominal_duration(a)
-                          for a in range(len(env.action_names))])
+    durations = np.array([*(robot.with_actions(env.action_names).nominal_duration(a)
+                            for a in range(len(env.action_names))), 0.0])  # declaring: no time
+    poses = _goal_poses(env)
     found: list[list[Episode]] = [[] for _ in range(count)]
     collisions, seconds, reward = np.zeros(count, int), np.zeros(count), np.zeros(count)
+    reached = np.zeros(count, bool)
     observation, info = env.reset(seed=seed)
+    paths = [[pose[:3]] for pose in info['pose']]
+    contacts: list[list[np.ndarray]] = [[] for _ in range(count)]
     while any(len(own) < each for own in found):
         actions = actor(observation, info['reset'])
         observation, rewards, terminated, truncated, info = env.step(actions)
@@ -39,6 +54,13 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
         collisions += info['collided'] & acting
         seconds += np.where(acting, durations[actions], 0)
         reward += rewards
+        reached |= info['arrived'] & acting
+        for n in range(count):
+            if info['reset'][n]:
+                paths[n], contacts[n] = [], []
+            paths[n].append(info['pose'][n, :3])
+            if info['collided'][n]:
+                contacts[n].append(info['pose'][n, :2])
         for n in np.nonzero(terminated | truncated)[0]:
             found[n].append(Episode(
                 success=bool(info['success'][n]), start_distance=float(info['start_distance'][n]),
@@ -46,49 +68,136 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
                 collisions=int(collisions[n]), seconds=float(seconds[n]),
                 stop_distance=float(info['distance'][n]),
                 stop_heading=float(info['heading_error'][n]), reward=float(reward[n]),
-                goal=env.goal_rooms[info['goal'][n]]))
-            collisions[n], seconds[n], reward[n] = 0, 0.0, 0.0
+                goal=env.goal_rooms[info['goal'][n]],
+                scene=int(env.houses[env.house_index[n]].seed),
+                declared=(None if env.declare_action is None
+                          else bool(actions[n] == env.declare_action)),
+                reached=bool(reached[n]), trajectory=np.array(paths[n]),
+                contacts=np.array(contacts[n]).reshape(-1, 2),
+                goal_pose=None if poses is None else tuple(poses[info['goal'][n]].tolist())))
+            collisions[n], seconds[n], reward[n], reached[n] = 0, 0.0, 0.0, False
     return [episode for own in found for episode in own[:each]]
 
 
+def _goal_poses(env) -> np.ndarray | None:
+    """[G,3] where the goals are; None where the task's goal is no pose."""
+    return env.goal_poses[:, :3] if env.config.task == 'image' else None
+
+
 def random_actor(env, seed: int) -> Actor:
-    """Uniform random actions."""
-    rng = np.random.default_rng(seed)
-    return lambda observation, reset: rng.integers(0, len(env.action_names), env.num_envs)
+    """Uniform random actions; where a stop is declared, that is one of them."""
+    rng, choices = np.random.default_rng(seed), int(env.single_action_space.n)
+    return lambda observation, reset: rng.integers(0, choices, env.num_envs)
+
+
+class PolicyActor:
+    """A trained policy.
+
+    Args:
+        env: where it acts; with `stop='declared'` it also declares that it has arrived.
+        network: the policy.
+        decoding: 'sample' or 'greedy'.
+        seed: of the sampled actions.
+        threshold: probability of having arrived above which it declares.
+    """
+
+    def __init__(self, env, network: Policy, decoding: str, seed: int,
+                 threshold: float = STOP_THRESHOLD):
+        self.env, self.threshold = env, threshold
+        self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
+
+    def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
+        actions = self.policy.act(observation, self.env.goals, reset)
+        if self.env.declare_action is None:
+            return actions
+        return np.where(self.policy.arrival > self.threshold, self.env.declare_action, actions)
+
+    @property
+    def knows_arrival(self) -> bool:
+        """Whether the network says if it has arrived; known after the first action."""
+        return bool(np.isfinite(self.policy.arrival).all())
 
 
 def policy_actor(env, network: Policy, decoding: str, seed: int) -> Actor:
-    """A trained policy."""
-    policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
-    return lambda observation, reset: policy.act(observation, env.goals, reset)
+    """A trained policy, see `PolicyActor`."""
+    return PolicyActor(env, network, decoding, seed)
 
 
-def evaluate(env, network: Policy, *, decoding: str, episodes: int = 100, controls: bool = True,
-             seed: int = 10_000, robot: RobotSpec | None = None) -> dict[str, dict]:
-    """All figures of a policy, and its controls on the same starts.
+def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decoding: str,
+            episodes: int = 100, controls: Sequence[str] = CONTROLS,
+            threshold: float | None = None, seed: int = 10_000,
+            robot: RobotSpec | None = None) -> Rows:
+    """Episodes of a policy and of its controls, the same number in each house.
+
+    A network with an arrival head is measured a second time, with declared stops.
+
+    Args:
+        make_env: (houses, environments, stop) -> vector environment in which environment i lives
+            in house i modulo their number; `stop` is 'arrival' or 'declared'.
+        network: the policy.
+        houses: seeds.
+        decoding: 'sample' or 'greedy'.
+        episodes: at least this many a row.
+        controls: which of `CONTROLS`, on the same starts.
+        threshold: of the arrival head; None: 0.5.
+        seed: of environments and sampled actions.
+        robot: for durations; the standard robot if left out.
 
     Returns:
-        {'right goal' | 'other decoding' | 'wrong goal' | 'blank goal' | 'random' |
-        'shortest path': summary}; without controls only the first.
+        By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
+        'declared': ...}; without an arrival head 'arrival' alone.
     """
-    robot = robot or RobotSpec()
+    robot, rows = robot or RobotSpec(), {}
+    threshold = STOP_THRESHOLD if threshold is None else threshold
+    each = -(-episodes // len(houses))
+    for chunk, begin in enumerate(range(0, len(houses), HOUSES_AT_ONCE)):
+        part = list(houses[begin:begin + HOUSES_AT_ONCE])
+        rounds = -(-each // max(1, ENVIRONMENTS // len(part)))
+        environments = len(part) * -(-each // rounds)
+        for stop in (ARRIVAL, DECLARED):
+            env = make_env(part, environments, stop)
+            actors = _actors(env, network, decoding, controls, threshold, seed + chunk)
+            for name, (actor, shown) in actors.items():
+                env.set_shown_goal(shown)
+                rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
+                    env, actor, rounds * environments, seed=seed + chunk, robot=robot))
+            if env.config.task != 'image' or not next(iter(actors.values()))[0].knows_arrival:
+                break  # nothing to declare, or nobody to declare it
+    return rows
 
-    def measure(actor: Actor, shown: str = 'right') -> dict:
-        env.set_shown_goal(shown)
-        return summarise(run_episodes(env, actor, episodes, seed=seed, robot=robot))
 
-    def act(rule: str) -> Actor:
-        return policy_actor(env, network, rule, seed)
+def _actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
+            seed: int) -> dict[str, tuple[Actor, str]]:
+    """Who drives in each row, and which goal picture it is shown; the policy itself first."""
+    def policy(rule: str = decoding) -> Actor:
+        return PolicyActor(env, network, rule, seed, threshold)
 
-    results = {f'right goal, {decoding}': measure(act(decoding))}
-    if controls:
+    rows = {f'right goal, {decoding}': (policy(), 'right')}
+    if OTHER in controls:
         other = 'greedy' if decoding == 'sample' else 'sample'
-        results |= {
-            f'right goal, {other}': measure(act(other)),
-            'wrong goal': measure(act(decoding), 'wrong'),
-            'blank goal': measure(act(decoding), 'blank'),
-            'random actions': measure(random_actor(env, seed)),
-            'shortest path': measure(lambda observation, reset: env.oracle_actions()),
-        }
-    env.set_shown_goal('right')
-    return results
+        rows[f'right goal, {other}'] = policy(other), 'right'
+    for name, shown in ((WRONG, 'wrong'), (BLANK, 'blank')):
+        if name in controls:
+            rows[name] = policy(), shown
+    if RANDOM in controls:
+        rows[RANDOM] = random_actor(env, seed), 'right'
+    if SHORTEST in controls:
+        rows[SHORTEST] = (lambda observation, reset: env.oracle_actions()), 'right'
+    return rows
+
+
+def figures(rows: Rows) -> dict[str, dict[str, dict]]:
+    """The summary of every row, by kind of stop."""
+    return {stop: {name: summarise(episodes) for name, episodes in own.items()}
+            for stop, own in rows.items()}
+
+
+def by_scene(rows: Rows) -> dict[int, Rows]:
+    """The same rows for each house alone, by its seed."""
+    scenes: dict[int, Rows] = {}
+    for stop, own in rows.items():
+        for name, episodes in own.items():
+            for episode in episodes:
+                scenes.setdefault(episode.scene, {}).setdefault(stop, {}).setdefault(
+                    name, []).append(episode)
+    return scenes

@@ -1,4 +1,9 @@
-"""What every figure means (docs/architecture.md, "Figures"), as pure functions over episodes."""
+"""What every figure means (docs/architecture.md, "Figures"), as pure functions over episodes.
+
+Arrival and declared stop are two kinds of episodes. Under *arrival* the simulator ends an episode
+when the robot is at its goal; under *declared stop* it drives on until the policy says that it has
+arrived, and is right or wrong. No summary mixes them.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,14 @@ from collections.abc import Sequence
 import numpy as np
 
 ARRIVAL_RADIUS = 0.6  # m: what the start distance is shortened by in SPL
+
+
+def _hidden():
+    return dataclasses.field(default=None, compare=False, repr=False)
+
+
+def _hidden():
+    return dataclasses.field(default=None, compare=False, repr=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +38,20 @@ class Episode:
     stop_heading: float  # rad, unsigned, at the end
     reward: float = 0.0  # undiscounted return
     goal: str = ''
+    scene: int = 0  # seed of the house
+    declared: bool | None = None  # whether the policy said "arrived"; None: nobody asked it to
+    reached: bool = False  # was at the goal at the end of some decision, declared or not
+    # What a map shows; no figure depends on it.
+    trajectory: np.ndarray | None = _hidden()  # [K,3] x, y [m], yaw [rad]: start and decisions
+    contacts: np.ndarray | None = _hidden()  # [C,2] where the robot touched something [m]
+    goal_pose: tuple[float, float, float] | None = _hidden()  # x, y, yaw; None: no such place
+    scene: int = 0  # seed of the house
+    declared: bool | None = None  # whether the policy said "arrived"; None: nobody asked it to
+    reached: bool = False  # was at the goal at the end of some decision, declared or not
+    # What a map shows; no figure depends on it.
+    trajectory: np.ndarray | None = _hidden()  # [K,3] x, y [m], yaw [rad]: start and decisions
+    contacts: np.ndarray | None = _hidden()  # [C,2] where the robot touched something [m]
+    goal_pose: tuple[float, float, float] | None = _hidden()  # x, y, yaw; None: no such place
 
 
 def path_efficiency(episode: Episode) -> float:
@@ -50,14 +77,21 @@ def bootstrap_interval(values: Sequence[float], *, samples: int = 2000, seed: in
 def summarise(episodes: Sequence[Episode]) -> dict:
     """All figures over some episodes, ready for JSON.
 
+    Under declared stop there are three more: `declared` and `false_stops`, the shares of episodes
+    that the policy ended, and that it ended in vain, and `reached`, the share in which the robot
+    stood at its goal at some time, whether it said so or not.
+
     Raises:
-        ValueError: no episodes.
+        ValueError: no episodes, or episodes of both kinds.
     """
     if not episodes:
         raise ValueError('figures need at least one episode; received none')
+    asked = {e.declared is not None for e in episodes}
+    if len(asked) > 1:
+        raise ValueError('arrival and declared stop are not mixed; received episodes of both')
     success = [float(e.success) for e in episodes]
     decisions = sum(e.decisions for e in episodes)
-    return {
+    figures = {
         'episodes': len(episodes),
         'success': float(np.mean(success)),
         'success_interval': list(bootstrap_interval(success)),
@@ -72,3 +106,17 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'return': float(np.mean([e.reward for e in episodes])),
         'start_distance': float(np.mean([e.start_distance for e in episodes])),
     }
+    if asked == {True}:
+        figures |= {
+            'declared': float(np.mean([e.declared for e in episodes])),
+            'false_stops': float(np.mean([e.declared and not e.success for e in episodes])),
+            'reached': float(np.mean([e.reached for e in episodes])),
+        }
+    return figures
+    if asked == {True}:
+        figures |= {
+            'declared': float(np.mean([e.declared for e in episodes])),
+            'false_stops': float(np.mean([e.declared and not e.success for e in episodes])),
+            'reached': float(np.mean([e.reached for e in episodes])),
+        }
+    return figures

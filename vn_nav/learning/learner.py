@@ -1,56 +1,116 @@
-"""Proximal policy optimisation (Schulman et al. 2017) with an LSTM; A2C is its one-epoch case."""
+"""One learner for every preset: proximal policy optimisation with auxiliary tasks.
+
+A2C is its case of one epoch, one batch and no clipping: at the first step the ratio of new to old
+probabilities is 1 and its gradient that of the log-probability (Huang et al., arXiv 2205.09123).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from vn_nav.errors import UserError
+from vn_nav.learning import auxiliary
+from vn_nav.learning.replay import Replay
 from vn_nav.learning.returns import generalised_advantages, masked_mean, normalise
 from vn_nav.learning.rollout import Rollout
 from vn_nav.observation import Observation
-from vn_nav.policy.network import Policy, RecurrentState
+from vn_nav.policy.network import IMAGE_HEADS, Policy, RecurrentState
+
+# Tasks whose weight is a field of `LearnerConfig`. The first three learn from the replay memory.
+REPLAY_TASKS = ('pixel_control', 'value_replay', 'reward_prediction')
+TASKS = (*REPLAY_TASKS, *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance')
+# What the environment has to tell beside the observation, by task.
+PRIVILEGED = {'depth': ('depth',), 'segmentation': ('segmentation',),
+              'goal_segmentation': ('goal_segmentation',), 'goal_pose': ('goal_pose', 'overlap'),
+              'arrival': ('arrived',), 'distance': ('distance',)}
 
 
 @dataclasses.dataclass(frozen=True)
 class LearnerConfig:
-    """Numbers of one update."""
+    """Numbers of one update. A weight of 0 switches an auxiliary task off."""
 
+    optimiser: str = 'adam'  # or 'rmsprop' (alpha 0.99, epsilon 1e-5)
     learning_rate: float = 4e-4  # at the start
     final_learning_rate: float = 4e-5
     gamma: float = 0.99  # discount
     lam: float = 0.95  # of the advantage estimator
-    clip: float = 0.2
+    clip: float | None = 0.2  # None: no clipping
     epochs: int = 3
     minibatches: int = 8  # by environments: sequences stay whole
+    normalise_advantage: bool = True
+    truncation_is_terminal: bool = False  # the published code's treatment of time-outs
     value_coefficient: float = 0.5
     entropy_coefficient: float = 0.01  # at the start
     final_entropy_coefficient: float = 0.005
     max_gradient_norm: float = 0.5
+    # Weights of the auxiliary tasks (thesis, table 5.1; the last four are ours).
+    pixel_control: float = 0.0
+    value_replay: float = 0.0
+    reward_prediction: float = 0.0
+    depth: float = 0.0
+    segmentation: float = 0.0
+    goal_segmentation: float = 0.0
+    reconstruction: float = 0.0
+    goal_pose: float = 0.0
+    arrival: float = 0.0
+    distance: float = 0.0
+    # The replay memory, used by `REPLAY_TASKS`, and by the image heads if `images_from_replay`.
+    images_from_replay: bool = True
+    replay_steps: int = 32_000  # of all environments together
+    replay_batch: int = 16  # sequences that each task draws for an update
+    replay_length: int = 20  # steps of a sequence
+    pixel_control_gamma: float = 0.9
+    pixel_change_grey: bool = True  # thesis; False: the published code's RGB
+    unrewarded: float = 1 / 3  # share of reward prediction's samples
 
     def __post_init__(self):
-        positive = ('learning_rate', 'final_learning_rate', 'clip', 'max_gradient_norm', 'epochs',
-                    'minibatches')
+        positive = ('learning_rate', 'final_learning_rate', 'max_gradient_norm', 'epochs',
+                    'minibatches', 'replay_steps', 'replay_batch', 'replay_length')
         for name in positive:
-            if not getattr(self, name) > 0:
-                raise UserError(f'{name} is positive', getattr(self, name), 'correct it')
-        for name in ('gamma', 'lam'):
+            value = getattr(self, name)
+            if not value > 0 and not (name == 'final_learning_rate' and value == 0):
+                raise UserError(f'{name} is positive', value, 'correct it')
+        if self.clip is not None and not self.clip > 0:
+            raise UserError('clip is positive, or None', self.clip, 'correct it')
+        for name in ('gamma', 'lam', 'pixel_control_gamma', 'unrewarded'):
             if not 0 <= getattr(self, name) <= 1:
                 raise UserError(f'{name} lies in [0, 1]', getattr(self, name), 'correct it')
+        for name in TASKS:
+            if not getattr(self, name) >= 0:
+                raise UserError(f'the weight {name} is not negative', getattr(self, name),
+                                'correct it')
+        if self.optimiser not in ('adam', 'rmsprop'):
+            raise UserError('the optimiser is adam or rmsprop', self.optimiser, 'choose one')
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The auxiliary tasks that are on."""
+        return tuple(name for name in TASKS if getattr(self, name) > 0)
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """The heads that the network needs for them."""
+        return tuple(name for name in self.tasks if name != 'value_replay')
+
+    @property
+    def privileged(self) -> tuple[str, ...]:
+        """What batches must hold beside the observations."""
+        return tuple(key for name in self.tasks for key in PRIVILEGED.get(name, ()))
+
+    @property
+    def from_replay(self) -> tuple[str, ...]:
+        """The tasks that learn from the replay memory."""
+        return tuple(name for name in self.tasks if name in REPLAY_TASKS
+                     or (name in IMAGE_HEADS and self.images_from_replay))
 
 
-class Losses(NamedTuple):
-    """Means over the minibatches of one update."""
-
-    policy: float
-    value: float
-    entropy: float  # nats
-    kl: float  # estimate of KL(behaviour || new policy)
-    clipped: float  # share of frames whose ratio was clipped
-    gradient_norm: float
+Losses = dict[str, float]  # means over the steps of one update
+BASIC_LOSSES = ('policy_loss', 'value_loss', 'entropy', 'kl', 'clipped', 'gradient_norm')
 
 
 class Learner:
@@ -59,19 +119,41 @@ class Learner:
     Args:
         network: its parameters are changed in place, its `compute_dtype` is used.
         config: numbers of the update.
-        generator: source of the order of environments.
+        generator: source of the order of environments and of replayed samples.
+        replay: the memory that `config.from_replay` learns from; fed by `update`.
+        average_gradients: called with the parameters between backward and step; for training on
+            several processes.
     """
 
-    def __init__(self, network: Policy, config: LearnerConfig, generator: torch.Generator):
+    def __init__(self, network: Policy, config: LearnerConfig, generator: torch.Generator, *,
+                 replay: Replay | None = None,
+                 average_gradients: Callable[[list[Tensor]], None] | None = None):
+        missing = [name for name in config.heads if name not in network.heads]
+        if missing:
+            raise UserError('the network has a head for every auxiliary task', missing,
+                            'add them to the heads of its configuration')
+        if config.from_replay and replay is None:
+            raise UserError('replayed tasks need a replay memory', config.from_replay,
+                            'pass one, or set their weights to 0')
         self.network, self.config, self.generator = network, config, generator
-        self.optimiser = torch.optim.Adam(network.parameters(), config.learning_rate, eps=1e-5)
+        self.replay, self.average_gradients = replay, average_gradients
+        self.failed_batch: Path | None = None  # where to leave a batch whose loss is not finite
+        parameters = list(network.parameters())
+        if config.optimiser == 'adam':
+            self.optimiser = torch.optim.Adam(parameters, config.learning_rate, eps=1e-5)
+        else:
+            self.optimiser = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99,
+                                                 eps=1e-5)
 
     def update(self, rollout: Rollout, progress: float = 0.0) -> Losses:
-        """Several epochs over one rollout.
+        """Several epochs over one rollout, each step with every auxiliary task.
 
         Args:
             rollout: what the present network collected.
             progress: share of the training that is over, in [0, 1], for the linear schedules.
+
+        Returns:
+            `BASIC_LOSSES` and the unweighted loss of each task, means over the steps.
 
         Raises:
             UserError: a loss or gradient is not finite; the weights are those before that step.
@@ -82,64 +164,138 @@ class Learner:
             group['lr'] = rate
         entropy_coefficient = _linear(config.entropy_coefficient,
                                       config.final_entropy_coefficient, progress)
-        advantage = generalised_advantages(
-            rollout.reward, rollout.value, rollout.terminated, rollout.truncated,
-            gamma=config.gamma, lam=config.lam)
+        if self.replay is not None:
+            self.replay.extend(rollout)
+        terminated, truncated = rollout.terminated, rollout.truncated
+        if config.truncation_is_terminal:
+            terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
+        advantage = generalised_advantages(rollout.reward, rollout.value, terminated, truncated,
+                                           gamma=config.gamma, lam=config.lam)
         target = advantage + rollout.value[:-1]
-        advantage = normalise(advantage, rollout.valid)
-        totals, updates = torch.zeros(len(Losses._fields)), 0
+        if config.normalise_advantage:
+            advantage = normalise(advantage, rollout.valid)
+        names = (*BASIC_LOSSES, *config.tasks)
+        totals, updates = torch.zeros(len(names)), 0
         environments = rollout.action.shape[1]
         for _ in range(config.epochs):
             order = torch.randperm(environments, generator=self.generator)
             for columns in order.chunk(config.minibatches):
-                totals += self._step(rollout, columns, advantage[:, columns], target[:, columns],
-                                     entropy_coefficient)
+                totals += self._step(select(rollout, columns), advantage[:, columns],
+                                     target[:, columns], entropy_coefficient)
                 updates += 1
-        return Losses(*(totals / updates).tolist())
+        return dict(zip(names, (totals / updates).tolist(), strict=True))
 
-    def _step(self, rollout: Rollout, columns: Tensor, advantage: Tensor, target: Tensor,
+    def _step(self, batch: Rollout, advantage: Tensor, target: Tensor,
               entropy_coefficient: float) -> Tensor:
-        """One step of Adam on the whole sequences of some environments."""
-        config, valid = self.config, rollout.valid[:, columns]
-        output, _ = self.network(
-            select(rollout.observation, columns), rollout.starts[:-1, columns],
-            RecurrentState(*(part[columns] for part in rollout.state)))
+        """One step of the optimiser: one loss, one backward pass, one clipping of the norm."""
+        config, valid = self.config, batch.valid
+        latents, _ = self.network.latents(_rows(batch.observation), batch.starts[:-1], batch.state)
+        output = self.network.read(latents)
         log_all = torch.log_softmax(output.logits, dim=-1)
-        log_new = log_all.gather(-1, rollout.action[:, columns].unsqueeze(-1)).squeeze(-1)
-        log_ratio = log_new - rollout.log_probability[:, columns]
+        log_new = log_all.gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
+        log_ratio = log_new - batch.log_probability
         ratio = log_ratio.exp()
-        clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
-        policy_loss = -masked_mean(torch.minimum(ratio * advantage, clipped * advantage), valid)
+        gain = ratio * advantage
+        if config.clip is not None:
+            clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
+            gain = torch.minimum(gain, clipped * advantage)
+        policy_loss = -masked_mean(gain, valid)
         value_loss = masked_mean((output.value - target) ** 2, valid)
         entropy = masked_mean(-(log_all.exp() * log_all).sum(-1), valid)
         loss = (policy_loss + config.value_coefficient * value_loss
                 - entropy_coefficient * entropy)
+        extra = {}
+        for name in config.tasks:
+            if name in config.from_replay:
+                extra[name] = self._replayed_loss(name)
+            else:
+                extra[name] = self._rollout_loss(name, latents, batch)
+            loss = loss + getattr(config, name) * extra[name]
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.max_gradient_norm)
+        parameters = [p for p in self.network.parameters() if p.grad is not None]
+        if self.average_gradients is not None:
+            self.average_gradients(parameters)
+        norm = torch.nn.utils.clip_grad_norm_(parameters, config.max_gradient_norm)
         if not torch.isfinite(loss + norm):
-            raise UserError(
-                'losses and gradients stay finite',
-                f'policy {policy_loss.item():g}, value {value_loss.item():g}, entropy '
-                f'{entropy.item():g}, gradient {norm.item():g}',
-                'lower the learning rate and resume from the last checkpoint')
+            self._give_up(batch, {
+                'policy': policy_loss, 'value': value_loss, 'entropy': entropy, **extra,
+                'gradient': norm})
         self.optimiser.step()
         with torch.no_grad():
             kl = masked_mean(ratio - 1 - log_ratio, valid)  # never negative
-            share = masked_mean(((ratio - 1).abs() > config.clip).float(), valid)
-            return torch.stack([policy_loss, value_loss, entropy, kl, share, norm])
+            share = (masked_mean(((ratio - 1).abs() > config.clip).float(), valid)
+                     if config.clip is not None else torch.zeros(()))
+            return torch.stack([policy_loss, value_loss, entropy, kl, share, norm,
+                                *extra.values()])
+
+    def _rollout_loss(self, name: str, latents, batch: Rollout) -> Tensor:
+        """Loss of a task on the batch of the policy itself."""
+        if name in IMAGE_HEADS:
+            return auxiliary.image_loss(self.network, name, latents, batch)
+        if name == 'goal_pose':
+            return auxiliary.goal_pose_loss(latents, batch)
+        loss = {'arrival': auxiliary.arrival_loss, 'distance': auxiliary.distance_loss}[name]
+        return loss(self.network, latents, batch)
+
+    def _replayed_loss(self, name: str) -> Tensor:
+        """Loss of a task on a draw of its own from the replay memory."""
+        config, network = self.config, self.network
+        if name == 'reward_prediction':
+            seen, label = self.replay.reward_frames(config.replay_batch, self.generator,
+                                                    unrewarded=config.unrewarded)
+            return auxiliary.reward_prediction_loss(network, network.maps(seen), label)
+        window = self.replay.windows(config.replay_batch, config.replay_length, self.generator)
+        if name in IMAGE_HEADS:
+            latents = network.latents(_rows(window.observation), window.starts[:-1])[0]
+            return auxiliary.image_loss(network, name, latents, window)
+        latents = network.latents(window.observation, window.starts)[0]
+        if name == 'value_replay':
+            return auxiliary.value_replay_loss(
+                network, latents, window, gamma=config.gamma,
+                truncation_is_terminal=config.truncation_is_terminal)
+        return auxiliary.pixel_control_loss(network, latents, window,
+                                            gamma=config.pixel_control_gamma,
+                                            grey=config.pixel_change_grey)
+
+    def _give_up(self, batch: Rollout, values: dict[str, Tensor]) -> None:
+        where = ''
+        if self.failed_batch is not None:
+            torch.save({'batch': dataclasses.asdict(batch),
+                        'losses': {name: float(value) for name, value in values.items()},
+                        'network': self.network.state_dict()}, self.failed_batch)
+            where = f'; the batch is in {self.failed_batch}'
+        raise UserError('losses and gradients stay finite',
+                        ', '.join(f'{name} {float(value):g}' for name, value in values.items()),
+                        f'lower the learning rate and resume from the last checkpoint{where}')
 
 
-def select(observation: Observation, columns: Tensor) -> Observation:
-    """Rows 0 to T-1 of some environments, with only the goals that occur in them.
+def select(rollout: Rollout, columns: Tensor) -> Rollout:
+    """Some environments of a rollout, with only the goals that occur in them.
 
     Pictures stay channels last in memory.
     """
-    image = observation.image[:-1].permute(0, 1, 3, 4, 2)[:, columns].permute(0, 1, 4, 2, 3)
-    used, index = torch.unique(observation.goal_index[:-1, columns], return_inverse=True)
-    return Observation(image, observation.goals[used], index,
-                       observation.last_action[:-1, columns],
-                       observation.last_reward[:-1, columns])
+    seen = rollout.observation
+    image = seen.image.permute(0, 1, 3, 4, 2)[:, columns].permute(0, 1, 4, 2, 3)
+    used, index = torch.unique(seen.goal_index[:, columns], return_inverse=True)
+    observation = Observation(image, seen.goals[used], index, seen.last_action[:, columns],
+                              seen.last_reward[:, columns])
+
+    def part(rows: Tensor | None) -> Tensor | None:
+        return None if rows is None else rows[:, columns]
+    return Rollout(
+        observation, *(part(getattr(rollout, name)) for name in (
+            'starts', 'action', 'reward', 'terminated', 'truncated', 'valid')),
+        state=(None if rollout.state is None
+               else RecurrentState(*(rows[columns] for rows in rollout.state))),
+        privileged={key: part(rows) for key, rows in rollout.privileged.items()},
+        log_probability=part(rollout.log_probability), value=part(rollout.value))
+
+
+def _rows(observation: Observation) -> Observation:
+    """All rows but the last, which only bootstraps."""
+    return Observation(observation.image[:-1], observation.goals,
+                       *(rows[:-1] for rows in observation[2:]))
 
 
 def _linear(first: float, last: float, progress: float) -> float:

@@ -1,4 +1,4 @@
-"""Returns and advantages."""
+"""Returns, advantages and the off-policy targets of replayed windows."""
 
 from __future__ import annotations
 
@@ -31,6 +31,67 @@ def generalised_advantages(reward: Tensor, value: Tensor, terminated: Tensor, tr
         following = delta[t] + gamma * lam * going_on[t] * following
         advantage[t] = following
     return advantage
+
+
+def n_step_returns(reward: Tensor, bootstrap_values: Tensor, terminated: Tensor,
+                   truncated: Tensor, valid: Tensor, *, gamma: float,
+                   truncation_is_terminal: bool = False) -> Tensor:
+    """Discounted returns to the end of the episode or rollout (Mnih et al. 2016, algorithm S3).
+
+    A return ends after a terminated step, which nothing follows; before a row that is no frame
+    (the true last observation of an episode, or padding), with that row's value; and at the
+    rollout's end, with the last row's value. On valid rows of a collected rollout it equals
+    `generalised_advantages` with lam = 1 plus the value.
+
+    Args:
+        reward: [T,B], after the action of the row.
+        bootstrap_values: [T+1,B], of the row's observation.
+        terminated, truncated, valid: [T,B] bool.
+        gamma: discount.
+        truncation_is_terminal: the published code's behaviour: a time-out is worth nothing.
+
+    Returns:
+        [T,B]; rows that are no frames get numbers without meaning: mask them.
+    """
+    over = terminated | truncated if truncation_is_terminal else terminated
+    ends = terminated | truncated
+    ends[:-1] |= ~valid[1:]
+    returns = torch.empty_like(reward)
+    following = bootstrap_values[-1]
+    for t in reversed(range(len(reward))):
+        following = torch.where(ends[t], bootstrap_values[t + 1], following)
+        # where, not multiplication: what follows an end may be NaN.
+        following = reward[t] + gamma * torch.where(over[t], 0.0, following)
+        returns[t] = following
+    return returns
+
+
+def n_step_q(reward: Tensor, bootstrap: Tensor, terminated: Tensor, valid: Tensor, *,
+             gamma: float) -> Tensor:
+    """N-step Q targets of pixel control, per cell (thesis 4.3.2).
+
+    For windows inside one episode, as `Replay.windows` gives them: the rows that are not valid
+    are padding at the end, and the bootstrap reaches past them.
+
+    Args:
+        reward: [T,B,h,w] pixel change.
+        bootstrap: [B,h,w], the maximum over actions of Q at each window's last observation
+            (row T, or the first padded row, which shows the same).
+        terminated: [T,B] bool; with truncated steps in it, time-outs are worth nothing either.
+        valid: [T,B] bool.
+        gamma: discount, 0.9 in the thesis.
+
+    Returns:
+        [T,B,h,w]; padded rows get numbers without meaning: mask them.
+    """
+    targets = torch.empty_like(reward)
+    following = bootstrap
+    for t in reversed(range(len(reward))):
+        over, real = terminated[t, :, None, None], valid[t, :, None, None]
+        step = reward[t] + gamma * torch.where(over, 0.0, following)
+        following = torch.where(real, step, following)
+        targets[t] = following
+    return targets
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:

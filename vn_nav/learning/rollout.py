@@ -15,8 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.network import Policy, RecurrentState
+from vn_nav.policy.memory import RecurrentState
+from vn_nav.policy.network import GoalMaps, Policy
 
 
 @dataclasses.dataclass
@@ -30,9 +32,12 @@ class Rollout:
     terminated: Tensor  # [T,B] bool
     truncated: Tensor  # [T,B] bool
     valid: Tensor  # [T,B] bool: False on reset rows, which are no frames
-    log_probability: Tensor  # [T,B] of the action when it was chosen
-    value: Tensor  # [T+1,B] when it was seen
     state: RecurrentState  # before the first row
+    # [T+1,B,...] What a simulator knows and the network must not see: targets of losses.
+    privileged: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+    # When it was chosen and seen; None where nobody wrote it down (replay, bags).
+    log_probability: Tensor | None = None  # [T,B] of the action
+    value: Tensor | None = None  # [T+1,B]
 
     @property
     def frames(self) -> int:
@@ -58,10 +63,14 @@ class Collector:
         env: a vector environment that observes as `vn_sim_bridge.env.NavigationEnv` does.
         network: the policy; it acts in its `compute_dtype`.
         generator: source of the sampled actions.
+        privileged: keys of the environment's `info` to keep beside the observations.
     """
 
-    def __init__(self, env, network: Policy, generator: torch.Generator):
+    def __init__(self, env, network: Policy, generator: torch.Generator,
+                 privileged: tuple[str, ...] = ()):
         self.env, self.network, self.generator = env, network, generator
+        self.privileged = privileged
+        self.told: dict[str, np.ndarray] = {}  # beside the present observation
         self.goals = torch.from_numpy(np.ascontiguousarray(env.goals))
         n = env.num_envs
         self.observation: dict[str, np.ndarray] = {}
@@ -74,7 +83,8 @@ class Collector:
 
     def begin(self, seed: int) -> None:
         """Reset every environment."""
-        self.observation, _ = self.env.reset(seed=seed)
+        self.observation, info = self.env.reset(seed=seed)
+        self.told = self._tell(info)
         self.starts[:] = True
         self.number += 1
         for total in (self._reward, self._decisions, self._collisions):
@@ -93,20 +103,25 @@ class Collector:
         image = torch.empty(steps + 1, n, size, size, 3, dtype=torch.uint8).permute(0, 1, 4, 2, 3)
         seen = Observation(image, self.goals, empty(steps + 1, whole), empty(steps + 1, whole),
                            empty(steps + 1, real))
+        told = {key: torch.empty(steps + 1, *rows.shape, dtype=torch.from_numpy(rows).dtype)
+                for key, rows in self.told.items()}
         rollout = Rollout(
             seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
-            empty(steps, flag), empty(steps, flag), empty(steps, flag), empty(steps, real),
-            empty(steps + 1, real), self.state)
-        goal_maps = self.network.encode_goals(self.goals)
+            empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, told,
+            empty(steps, real), empty(steps + 1, real))
+        goal_maps = GoalMaps(self.network)
         episodes: list[Episode] = []
         for t in range(steps + 1):
             for name, rows in seen._asdict().items():
                 if name != 'goals':
                     rows[t] = torch.from_numpy(self.observation[name])
+            for key, rows in told.items():
+                rows[t] = torch.from_numpy(self.told[key])
             rollout.starts[t] = self.starts
             now = slice(t, t + 1)
-            row = Observation(image[now], self.goals, *(part[now] for part in seen[2:]))
-            output, state = self.network(row, rollout.starts[now], self.state, goal_maps)
+            row = Observation(image[now], None, None, *(part[now] for part in seen[3:]))
+            output, state = self.network(row, rollout.starts[now], self.state,
+                                         goal_maps.of(self.goals, seen.goal_index[t]))
             rollout.value[t] = output.value[0]
             if t == steps:
                 break  # this observation only bootstraps; the next rollout begins with it
@@ -118,10 +133,19 @@ class Collector:
             self._step(rollout, t, episodes)
         return rollout, episodes
 
+    def _tell(self, info: dict) -> dict[str, np.ndarray]:
+        missing = [key for key in self.privileged if key not in info]
+        if missing:
+            raise UserError('the environment tells everything that the auxiliary tasks need',
+                            missing, 'list it among its privileged outputs, or set the weight of '
+                            'those tasks to 0')
+        return {key: np.array(info[key]) for key in self.privileged}
+
     def _step(self, rollout: Rollout, t: int, episodes: list[Episode]) -> None:
         """Step the environment with row t's actions and write down what came of it."""
         self.observation, reward, terminated, truncated, info = self.env.step(
             rollout.action[t].numpy())
+        self.told = self._tell(info)
         reset = np.asarray(info['reset'])
         rollout.reward[t] = torch.from_numpy(np.asarray(reward, np.float32))
         rollout.terminated[t] = torch.from_numpy(terminated)
@@ -144,6 +168,7 @@ class Collector:
         return {
             'observation': {name: torch.from_numpy(np.array(rows))
                             for name, rows in self.observation.items()},
+            'told': {key: torch.from_numpy(rows) for key, rows in self.told.items()},
             'starts': self.starts.clone(),
             'memory': [part.clone() for part in self.state],
             'totals': [torch.from_numpy(total.copy()) for total in self._totals()],
@@ -152,6 +177,7 @@ class Collector:
     def load_state_dict(self, state: dict) -> None:
         """Go on where `state_dict` was taken; the environment must stand there too."""
         self.observation = {name: rows.numpy() for name, rows in state['observation'].items()}
+        self.told = {key: rows.numpy() for key, rows in state['told'].items()}
         self.starts = state['starts']
         self.state = RecurrentState(*state['memory'])
         for total, saved in zip(self._totals(), state['totals'], strict=True):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import hashlib
-import io
 import math
 import signal
 import sys
@@ -20,61 +18,26 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.learning.curriculum import Curriculum, FrameCurriculum
-from vn_nav.learning.learner import Learner, LearnerConfig
+from vn_nav.learning.learner import BASIC_LOSSES, TASKS, Learner
+from vn_nav.learning.pairs import PairConfig, PairSource, pretrain_pairs
+from vn_nav.learning.presets import TrainConfig
+from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector, Episode
-from vn_nav.policy.checkpoint import save_checkpoint, write_file
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.learning.state_file import read_state, write_state
+from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint, write_file
+from vn_nav.policy.network import Policy
 
-CHECKPOINT, STATE = 'checkpoint', 'training_state'
+CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
+FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
 METRICS, TENSORBOARD = 'metrics.csv', 'tensorboard'
 COLUMNS = ('frames', 'minutes', 'fps', 'tau', 'success', 'return', 'length', 'collisions',
-           'policy_loss', 'value_loss', 'entropy', 'kl', 'clipped', 'gradient_norm',
-           'collect_seconds', 'update_seconds')
+           *BASIC_LOSSES, 'collect_seconds', 'update_seconds', *TASKS)
 RECENT = 200  # episodes that the shown success, return, length and collisions are means over
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainConfig(LearnerConfig):
-    """All numbers of a training, beside those of the environment."""
-
-    frames: int = 3_000_000  # agent decisions; the linear schedules end here
-    minutes: float | None = None  # wall-clock limit; the schedules end with it if it comes first
-    rollout_length: int = 64  # steps
-    channels: tuple[int, int, int] = (32, 64, 32)
-    features: int = 256
-    hidden: int = 256
-    curriculum: str = 'success'  # or 'frames': what raises the difficulty
-    start_difficulty: float = 0.3  # tau of the curriculum; 1 switches it off
-    success_to_advance: float = 0.75
-    difficulty_step: float = 0.1
-    advance_window: int = 200  # episodes
-    seed: int = 0
-    bf16: bool | None = None  # None: where the processor multiplies bfloat16 in hardware
-    threads: int = 1  # of torch
-    checkpoint_seconds: float = 60.0
-    tensorboard: bool = False
-
-    def __post_init__(self):
-        super().__post_init__()
-        rules = (
-            (self.frames >= 1, 'a training has at least one frame', self.frames),
-            (self.minutes is None or self.minutes > 0, 'a wall-clock limit is positive',
-             self.minutes),
-            (self.rollout_length >= 2, 'rollout_length is at least 2', self.rollout_length),
-            (self.curriculum in ('success', 'frames'), 'the curriculum is success or frames',
-             self.curriculum),
-            (0 < self.start_difficulty <= 1, 'start_difficulty lies in (0, 1]',
-             self.start_difficulty),
-            (self.difficulty_step > 0, 'difficulty_step is positive', self.difficulty_step),
-            (self.advance_window >= 1, 'advance_window is positive', self.advance_window),
-            (self.threads >= 1, 'threads is at least 1', self.threads),
-        )
-        for kept, rule, received in rules:
-            if not kept:
-                raise UserError(rule, received, 'correct the training configuration')
-
-
 def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False, info: dict,
+          init: str | Path | None = None,
+          pairs: Callable[[], tuple[PairSource, PairSource]] | None = None,
           on_update: Callable[[dict], None] | None = None) -> Path:
     """Train a policy; SIGINT and SIGTERM save and end it early, cleanly.
 
@@ -91,6 +54,8 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
         resume: go on from the folder's last save.
         info: what the checkpoint shall say, see `vn_nav.policy.checkpoint.INFO`; frames, minutes,
             seed and world version are filled in.
+        init: a checkpoint to begin with.
+        pairs: makes the picture pairs for `config.pair_minutes`, and those to judge by.
         on_update: called with each row of the metrics.
 
     Returns:
@@ -101,12 +66,18 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
     """
     folder = Path(folder)
     training = _Training(env, config, folder, info)
-    if resume:
+    # Interrupted before the first frame, a training goes on with its pairs.
+    before_frames = (folder / PAIRS).exists() and not (folder / STATE).exists()
+    if resume and not before_frames:
         training.load()
     else:
         if (folder / STATE).exists():
             raise UserError('a new training has a folder of its own', str(folder),
                             'resume the training there, or choose another folder')
+        if init is not None:
+            training.network.load_state_dict(_initial_weights(init, training.network))
+        elif config.pair_minutes and pairs is not None:
+            training.learn_pairs(*pairs())
         training.begin()
     with _Signals() as stopped, _Log(folder, config, training.frames) as log:
         saved = time.monotonic()
@@ -120,6 +91,21 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
                 saved = time.monotonic()
         training.save()
     return folder / CHECKPOINT
+
+
+def _initial_weights(source: str | Path, network: Policy) -> dict[str, torch.Tensor]:
+    """The weights of a checkpoint, and a network's own for heads that the checkpoint lacks."""
+    own, given = network.state_dict(), load_checkpoint(source).network.state_dict()
+    for name, tensor in own.items():
+        if name not in given and name.startswith('heads.'):
+            given[name] = tensor
+        elif name not in given or given[name].shape != tensor.shape:
+            raise UserError(
+                f'a training begins with a checkpoint of the same network: {name} is '
+                f'{tuple(tensor.shape)}', tuple(given[name].shape) if name in given else 'absent',
+                'choose the same architecture, size, channels, features and hidden, or leave '
+                'out --init')
+    return {name: given[name] for name in own}
 
 
 def has_fast_bfloat16() -> bool:
@@ -141,14 +127,13 @@ class _Training:
         size = env.single_observation_space['image'].shape[-1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = Policy(NetworkConfig(
-                actions=tuple(env.action_names), size=size, channels=config.channels,
-                features=config.features, hidden=config.hidden))
+            self.network = Policy(config.network(tuple(env.action_names), size))
         bf16 = has_fast_bfloat16() if config.bf16 is None else config.bf16
         self.network.compute_dtype = torch.bfloat16 if bf16 else torch.float32
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.learner = Learner(self.network, config, self.generator)
-        self.collector = Collector(env, self.network, self.generator)
+        self.learner = Learner(self.network, config, self.generator, replay=self._replay(size))
+        self.learner.failed_batch = folder / FAILED_BATCH
+        self.collector = Collector(env, self.network, self.generator, config.privileged)
         if config.curriculum == 'frames':
             self.curriculum = FrameCurriculum(start=config.start_difficulty)
         else:
@@ -157,6 +142,31 @@ class _Training:
                 step=config.difficulty_step, window=config.advance_window)
         self.recent: deque[Episode] = deque(maxlen=RECENT)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
+        self.clock = time.monotonic()
+
+    def _replay(self, size: int) -> Replay | None:
+        config, env = self.config, self.env
+        if not config.from_replay:
+            return None
+        return Replay(
+            -(-config.replay_steps // env.num_envs), env.num_envs, size,
+            torch.from_numpy(np.ascontiguousarray(env.goals)),
+            privileged=tuple(key for key in config.privileged
+                             if key in ('depth', 'segmentation')),
+            goal_segmentation=(torch.from_numpy(env.goal_segmentation)
+                               if 'goal_segmentation' in config.privileged else None),
+            directory=self.folder / REPLAY)
+
+    def learn_pairs(self, source: PairSource, validation: PairSource) -> None:
+        """Pre-train the encoder; its time counts."""
+        def say(row: dict) -> None:
+            print(f'pairs {row["pairs"]:,} · {row["minutes"]:.1f} min · in unseen houses: '
+                  f'bearing {row["validation_bearing_deg"]:.0f} deg, heading '
+                  f'{row["validation_heading_deg"]:.0f} deg, overlap '
+                  f'{row["validation_overlap_accuracy"]:.0%}', flush=True)
+        config = PairConfig(minutes=self.config.pair_minutes)
+        pretrain_pairs(self.network, source, validation, self.folder / PAIRS, config, say)
+        self.seconds = 60 * self.config.pair_minutes
         self.clock = time.monotonic()
 
     def begin(self) -> None:
@@ -195,15 +205,13 @@ class _Training:
             _mean(episode.reward for episode in self.recent),
             _mean(episode.decisions for episode in self.recent),
             sum(episode.collisions for episode in self.recent) / decisions,
-            *losses, middle - start, end - middle), strict=True))
+            *(losses[name] for name in BASIC_LOSSES), middle - start, end - middle,
+            *(losses.get(name, math.nan) for name in TASKS)), strict=True))
 
     def save(self) -> None:
         """Write the training state, then the checkpoint; each whole or not at all."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        buffer = io.BytesIO()
-        torch.save(self._state_dict(), buffer)
-        data = buffer.getvalue()
-        write_file(self.folder / STATE, hashlib.sha256(data).hexdigest().encode() + b'\n' + data)
+        write_state(self.folder / STATE, self._state_dict())
         save_checkpoint(self.folder / CHECKPOINT, self.network, {
             **self.info, 'frames': self.frames, 'minutes': round(self.seconds / 60, 2)})
 
@@ -218,11 +226,7 @@ class _Training:
         if not path.is_file():
             raise UserError('a training is resumed from its folder', str(path),
                             'start it without resume, or name the folder of one')
-        digest, _, data = path.read_bytes().partition(b'\n')
-        if hashlib.sha256(data).hexdigest().encode() != digest:
-            raise UserError('the training state has the SHA-256 of its first line', str(path),
-                            'the file is corrupt: start a new training')
-        state = torch.load(io.BytesIO(data), weights_only=True)
+        state = read_state(path)
         for name, value in self._identity().items():
             if state['identity'].get(name) != value:
                 raise UserError(f'a training is resumed with its own {name}: '

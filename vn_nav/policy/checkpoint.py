@@ -22,7 +22,7 @@ from vn_nav.errors import UserError
 from vn_nav.policy.network import NetworkConfig, Policy
 
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
-FORMAT = 1
+FORMAT = 2
 DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
 # What a checkpoint says beside its weights, and what it says when nobody told it.
@@ -36,6 +36,10 @@ INFO = {
     'task': 'image',  # what it was trained for
     'objects': 1,  # in the house at a time
     'randomisation': 'none',  # of light, camera and base: a name, or a file's path
+    'preset': '',  # see vn_nav.learning.presets
+    'goals_per_room': 1,  # of each house
+    'goal_variants': None,  # differently lit pictures of each goal; None: the randomisation's
+    'stop_threshold': None,  # probability of arrival above which the policy declares its stop
     'seed': None,
     'frames': 0,  # agent decisions
     'minutes': 0.0,  # wall-clock of training
@@ -204,9 +208,7 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         'Actions': ', '.join(config['action_names']),
         'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
             config['decoding']],
-        'Network': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and goal '
-                   f'fused in the first; {network["features"]} features; LSTM '
-                   f'{network["hidden"]}; {parameters:,} parameters, {size / 1e6:.1f} MB',
+        'Network': f'{_describe(network)}; {parameters:,} parameters, {size / 1e6:.1f} MB',
         'Trained in': home,
         'Training': f'{config["frames"]:,} frames (agent decisions) in {config["minutes"]:.1f} '
                     f'minutes, seed {config["seed"]}',
@@ -224,6 +226,20 @@ def model_card(config: dict, parameters: int, size: int) -> str:
     if config['notes']:
         lines += ['', '## Notes', '', str(config['notes'])]
     return '\n'.join(lines) + '\n'
+
+
+def _describe(network: dict) -> str:
+    """The network in words."""
+    words = {'thesis': "the thesis's two streams", 'unreal': "UNREAL's single stream",
+             'fused': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
+                      f'goal fused in the first; {network["features"]} features'}[
+        network['architecture']]
+    if network['blocks']:
+        words += f'; {network["blocks"]} residual block(s) a stage'
+    words += (f'; {network["frames"]} stacked frames' if network['frames'] > 1
+              else f'; LSTM {network["hidden"]}')
+    heads = ', '.join(network['heads']).replace('_', ' ')
+    return words + (f'; heads {heads}' if heads else '')
 
 
 def _results_table(results: dict) -> list[str]:

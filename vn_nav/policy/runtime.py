@@ -11,7 +11,8 @@ import torch
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import DECODINGS, load_checkpoint
-from vn_nav.policy.network import Policy, RecurrentState
+from vn_nav.policy.memory import RecurrentState
+from vn_nav.policy.network import GoalMaps, Policy
 
 
 def choose(logits: torch.Tensor, decoding: str, generator: torch.Generator) -> torch.Tensor:
@@ -57,7 +58,6 @@ class PolicyRuntime:
         self._network = checkpoint.network
         self._generator = torch.Generator().manual_seed(seed)
         self._goal_maps: torch.Tensor | None = None
-        self._index = torch.zeros(1, 1, dtype=torch.int64)
         self._reward = torch.zeros(1, 1)  # a robot gets none
         self.reset()
 
@@ -83,7 +83,7 @@ class PolicyRuntime:
         if self._goal_maps is None:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         observation = Observation(
-            self._tensor(image)[None, None], None, self._index,
+            self._tensor(image)[None, None], None, None,
             torch.tensor([[self._last_action]]), self._reward)
         starts = torch.tensor([[self._last_action < 0]])
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -108,15 +108,20 @@ class BatchedPolicy:
         num_envs: environments N.
         decoding: 'sample' or 'greedy'.
         seed: of the sampled actions.
+
+    Attributes:
+        arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
+            the observation that `act` saw last; nan where the network has no such head.
     """
 
     def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0):
         _check_decoding(decoding)
         self.network, self.decoding = network, decoding
         self._generator = torch.Generator().manual_seed(seed)
+        self.arrival = np.full(num_envs, np.nan, np.float32)
         self._state: RecurrentState = network.initial_state(num_envs)
         self._goals: np.ndarray | None = None
-        self._goal_maps: torch.Tensor | None = None
+        self._goal_maps = GoalMaps(network)
 
     @torch.inference_mode()
     def act(self, obs: dict[str, np.ndarray], goals: np.ndarray, reset_mask: np.ndarray
@@ -133,14 +138,17 @@ class BatchedPolicy:
             FloatingPointError: the logits are not finite.
         """
         if goals is not self._goals:
-            self._goals = goals
-            self._goal_maps = self.network.encode_goals(torch.from_numpy(goals))
+            self._goals, self._goal_maps = goals, GoalMaps(self.network)
+        maps = self._goal_maps.of(torch.from_numpy(goals),
+                                  torch.from_numpy(np.asarray(obs['goal_index'])))
         observation = Observation(
-            torch.from_numpy(obs['image'])[None], None,
+            torch.from_numpy(obs['image'])[None], None, None,
             *(torch.from_numpy(np.asarray(obs[name]))[None]
-              for name in ('goal_index', 'last_action', 'last_reward')))
+              for name in ('last_action', 'last_reward')))
         starts = torch.from_numpy(np.asarray(reset_mask, bool))[None]
-        output, self._state = self.network(observation, starts, self._state, self._goal_maps)
+        output, self._state = self.network(observation, starts, self._state, maps)
+        if output.arrival is not None:
+            self.arrival = torch.sigmoid(output.arrival[0]).numpy()
         return choose(output.logits[0], self.decoding, self._generator).numpy()
 
 

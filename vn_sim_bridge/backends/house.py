@@ -62,6 +62,10 @@ class HouseBackend:
         """[N,4] x, y, yaw, pitch; a view that changes with the next move."""
         return self.world.poses
 
+    def enter(self, env_ids: np.ndarray, houses: np.ndarray) -> None:
+        """Put robots [K] into houses [K]; their poses are still to be set."""
+        self.world.house_index[env_ids] = houses
+
     def place(self, env_ids: np.ndarray, poses: np.ndarray) -> None:
         """Put robots [K] at poses [K,4]."""
         self.world.poses[env_ids] = poses
@@ -137,13 +141,26 @@ class HouseBackend:
                 self._stand(objects, k, house_index[k], items)
         return self._draw(house_index, poses, out, appearance, keys, objects)
 
-    def _draw(self, house_index, poses, out, appearance, keys, objects) -> Frames:
+    def cameras(self, poses: np.ndarray | None = None, appearance: Appearance | None = None
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Where cameras are and look, [K,5] as `Rasterizer.render` takes them, and their fov [K].
+
+        Args:
+            poses: [K,4] of the robots that hold them; default: the robots as they stand now.
+            appearance: of each picture; default: that of the robots' episodes.
+        """
         robot = self.robot
+        poses = self.world.poses if poses is None else poses
+        appearance = appearance or self._appearance
         cameras = np.column_stack([poses[:, :2], robot.camera_height + appearance.height,
                                    poses[:, 2],
                                    poses[:, 3] + robot.camera_pitch + appearance.pitch])
+        return cameras, robot.camera_fov + appearance.fov
+
+    def _draw(self, house_index, poses, out, appearance, keys, objects) -> Frames:
+        cameras, fov = self.cameras(poses, appearance)
         frames = Frames(*self._renderer.render(
-            house_index, cameras, robot.camera_fov + appearance.fov, out,
+            house_index, cameras, fov, out,
             lights=Lights(appearance.cube, appearance.lamps), objects=objects))
         if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:
             if keys is None:

@@ -51,13 +51,15 @@ ROOM_ORDER = ('living_room', 'kitchen', 'bedroom', 'bathroom', 'office', 'dining
               'hall', 'bathroom', 'bedroom', 'office', 'living_room')
 
 
-def generate_house(seed: int, *, rooms: int = 5, goals_per_room: int = 1) -> House:
+def generate_house(seed: int, *, rooms: int = 5, goals_per_room: int = 1,
+                   goal_seed: int = 0) -> House:
     """Build a house.
 
     Args:
         seed: 0 to 12,999 (see `splits`); equal seeds give equal houses.
         rooms: number of rooms, 1 to 12. From four on there may be a second wing.
         goals_per_room: places in each room where goal pictures are taken.
+        goal_seed: 0: the house's own goals; else other ones, by the same rule, in the same house.
 
     Raises:
         UserError: a seed or a number of rooms outside its range.
@@ -69,6 +71,8 @@ def generate_house(seed: int, *, rooms: int = 5, goals_per_room: int = 1) -> Hou
         raise UserError(f'a house has 1 to {MAX_ROOMS} rooms', rooms, 'choose a number in range')
     if not 1 <= goals_per_room <= 16:
         raise UserError('a room has 1 to 16 goals', goals_per_room, 'choose a number in range')
+    if goal_seed < 0:
+        raise UserError('the seed of goals is not negative', goal_seed, 'choose another')
     rng = np.random.default_rng([seed, rooms])
     count = 2 if rooms >= TWO_WINGS_FROM and rng.random() < TWO_WINGS else 1
     while True:  # a floor plan without doors for every room is drawn again; seldom more than twice
@@ -77,7 +81,8 @@ def generate_house(seed: int, *, rooms: int = 5, goals_per_room: int = 1) -> Hou
         doors = place_doors(cells, rng)
         if doors is not None:
             break
-    return _Construction(seed, look, parts, doors, rng).house(goals_per_room)
+    goals = np.random.default_rng([seed, rooms, goal_seed]) if goal_seed else rng
+    return _Construction(seed, look, parts, doors, rng).house(goals_per_room, goals)
 
 
 class _Construction:
@@ -98,7 +103,7 @@ class _Construction:
         self.clearance = clearance(self.origin, self.shape,
                                    np.array([o.rect for o in self.obstacles]))
 
-    def house(self, goals_per_room: int) -> House:
+    def house(self, goals_per_room: int, goal_rng: np.random.Generator) -> House:
         """Run the construction."""
         for index in range(len(self.rooms)):
             self.builder.room = index
@@ -119,7 +124,7 @@ class _Construction:
             np.array([self.outline.x1, self.outline.y1, HEIGHT])))
         floor = floor_map(self.outline, np.array([o.rect for o in self.obstacles]),
                           FOOTPRINT_RADIUS)
-        goals = choose_goals(scene, self.rooms, floor, self.rng, goals_per_room)
+        goals = choose_goals(scene, self.rooms, floor, goal_rng, goals_per_room)
         return House(f'house-{self.seed}-{len(self.rooms)}', self.seed, self.outline, scene,
                      tuple(self.rooms), tuple(self.obstacles),
                      tuple(Goal(pose, room) for pose, room in goals), FOOTPRINT_RADIUS)

@@ -1,0 +1,137 @@
+"""Presets: the method of the thesis, its baselines, and our best, as numbers of one learner.
+
+A preset says how to learn and in what environments (`ENVIRONMENT`). `vn_nav train --preset NAME`
+starts from it; every number can be changed from the command line.
+
+| preset | what it is |
+|---|---|
+| `thesis` | A2CAT-VN: batched A2C, LSTM, off-policy critic, pixel control, reward prediction, depth, both segmentations (thesis, table 5.1) |
+| `unreal` | the same without the three image heads (thesis, 5.7; Jaderberg et al. 2016) |
+| `a2c` | the same without any auxiliary task |
+| `framestack` | `unreal` with the last four pictures and a linear layer instead of the LSTM (thesis, 5.4) |
+| `fast` | PPO, early fusion, GAE, Adam, success-driven curriculum, and goal poses |
+"""  # noqa: E501
+
+from __future__ import annotations
+
+import dataclasses
+
+from vn_nav.errors import UserError
+from vn_nav.learning.learner import LearnerConfig
+from vn_nav.policy.encoders import LARGE
+from vn_nav.policy.network import NetworkConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig(LearnerConfig):
+    """All numbers of a training, beside those of the environment."""
+
+    preset: str = 'fast'  # where the numbers come from
+    frames: int = 3_000_000  # agent decisions; the linear schedules end here
+    minutes: float | None = None  # wall-clock limit; the schedules end with it if it comes first
+    rollout_length: int = 64  # steps
+    # The network, see `NetworkConfig`.
+    architecture: str = 'fused'
+    channels: tuple[int, int, int] = (32, 64, 32)
+    blocks: int = 0
+    features: int = 256
+    hidden: int = 256
+    stacked_frames: int = 1
+    deconvolutions: int | None = None  # None: one below `LARGE` pixels, else two (table 5.1)
+    pose_to_memory: bool = False
+    pixel_mean: float = 120.0
+    pixel_std: float = 36.0
+    # Before the first frame: the encoder learns from picture pairs, see `vn_nav.learning.pairs`.
+    pair_minutes: float = 0.0
+    pair_houses: int = 256
+    curriculum: str = 'success'  # or 'frames': what raises the difficulty
+    start_difficulty: float = 0.3  # tau of the curriculum; 1 switches it off
+    success_to_advance: float = 0.75
+    difficulty_step: float = 0.1
+    advance_window: int = 200  # episodes
+    seed: int = 0
+    bf16: bool | None = None  # None: where the processor multiplies bfloat16 in hardware
+    threads: int = 1  # of torch
+    checkpoint_seconds: float = 60.0
+    tensorboard: bool = False
+
+    def __post_init__(self):
+        super().__post_init__()
+        rules = (
+            (self.frames >= 1, 'a training has at least one frame', self.frames),
+            (self.minutes is None or self.minutes > 0, 'a wall-clock limit is positive',
+             self.minutes),
+            (self.rollout_length >= 2, 'rollout_length is at least 2', self.rollout_length),
+            (self.curriculum in ('success', 'frames'), 'the curriculum is success or frames',
+             self.curriculum),
+            (0 < self.start_difficulty <= 1, 'start_difficulty lies in (0, 1]',
+             self.start_difficulty),
+            (self.difficulty_step > 0, 'difficulty_step is positive', self.difficulty_step),
+            (self.advance_window >= 1, 'advance_window is positive', self.advance_window),
+            (self.pair_minutes == 0 or (self.pair_minutes > 0 and 'goal_pose' in self.tasks),
+             'picture pairs teach the task goal_pose: pair_minutes needs its weight',
+             self.pair_minutes),
+            (self.pair_houses >= 1, 'pair_houses is positive', self.pair_houses),
+            (self.threads >= 1, 'threads is at least 1', self.threads),
+        )
+        for kept, rule, received in rules:
+            if not kept:
+                raise UserError(rule, received, 'correct the training configuration')
+
+    def network(self, actions: tuple[str, ...], size: int) -> NetworkConfig:
+        """The network for a robot's actions and a picture size, with the heads of the tasks."""
+        deconvolutions = self.deconvolutions or (1 if size < LARGE else 2)
+        return NetworkConfig(
+            actions=actions, size=size, architecture=self.architecture, channels=self.channels,
+            blocks=self.blocks, features=self.features, hidden=self.hidden,
+            frames=self.stacked_frames, heads=self.heads, deconvolutions=deconvolutions,
+            pose_to_memory=self.pose_to_memory, pixel_mean=self.pixel_mean,
+            pixel_std=self.pixel_std)
+
+
+_A2C = {
+    'optimiser': 'rmsprop', 'learning_rate': 7e-4, 'final_learning_rate': 0.0, 'gamma': 0.99,
+    'lam': 1.0, 'clip': None, 'epochs': 1, 'minibatches': 1, 'normalise_advantage': False,
+    'value_coefficient': 0.5, 'entropy_coefficient': 0.001, 'final_entropy_coefficient': 0.001,
+    'max_gradient_norm': 0.5, 'frames': 40_000_000, 'rollout_length': 20,
+    'architecture': 'thesis', 'hidden': 512, 'pixel_mean': 0.0, 'pixel_std': 255.0,
+    'curriculum': 'frames', 'start_difficulty': 0.3, 'bf16': False,
+    'replay_steps': 32_000, 'replay_batch': 16, 'replay_length': 20, 'pixel_control_gamma': 0.9,
+}
+_UNREAL = _A2C | {'value_replay': 1.0, 'pixel_control': 0.05, 'reward_prediction': 1.0}
+PRESETS: dict[str, dict] = {
+    'a2c': _A2C,
+    'unreal': _UNREAL,
+    'framestack': _UNREAL | {'stacked_frames': 4},
+    'thesis': _UNREAL | {'depth': 0.1, 'segmentation': 0.1, 'goal_segmentation': 0.1},
+    'fast': {
+        'learning_rate': 4e-4, 'final_learning_rate': 4e-5, 'clip': 0.2, 'epochs': 2,
+        'minibatches': 4, 'entropy_coefficient': 0.008, 'final_entropy_coefficient': 0.003,
+        'frames': 1_600_000, 'rollout_length': 32, 'channels': (16, 32, 64), 'features': 256,
+        'hidden': 256, 'goal_pose': 0.5, 'arrival': 0.2, 'distance': 0.1,
+        'pose_to_memory': True, 'pair_minutes': 5.0,
+    },
+}
+_THESIS_ENVIRONMENT = {'envs': 16, 'max_decisions': 900, 'progress_reward': 0.0,
+                       'collision_reward': 0.0}
+# What each preset learns in, as options of `vn_nav train`.
+ENVIRONMENT: dict[str, dict] = {
+    **{name: _THESIS_ENVIRONMENT for name in PRESETS},
+    'fast': {'envs': 64, 'max_decisions': 300, 'progress_reward': 1.0, 'collision_reward': -0.02},
+}
+
+
+def preset(name: str, **changes) -> TrainConfig:
+    """The configuration of a preset with some numbers changed.
+
+    Raises:
+        UserError: an unknown preset or number.
+    """
+    if name not in PRESETS:
+        raise UserError(f'a preset is one of {", ".join(PRESETS)}', name, 'choose one')
+    try:
+        return TrainConfig(**{**PRESETS[name], 'preset': name, **changes})
+    except TypeError as error:
+        known = ', '.join(field.name for field in dataclasses.fields(TrainConfig))
+        raise UserError(f'a training has only the numbers {known}', str(error),
+                        'correct the name') from error

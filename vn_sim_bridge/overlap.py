@@ -1,0 +1,112 @@
+"""How two views of a house relate: the pose of one as the other sees it, and what both show.
+
+Pure functions of poses, depth pictures and cameras. They are labels for learning and figures for
+evaluation; no network is ever shown them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+GRID = 8  # points across a goal picture, and down
+FARTHEST = 12.0  # m: a point beyond is left out
+TOLERANCE = 0.1  # share of its depth by which a point may disagree with the robot's picture,
+SLACK = 0.05  # m, and this much more
+
+
+def relative_pose(poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
+    """Goal poses as robots see them.
+
+    Args:
+        poses: [N,4] x, y [m], yaw, pitch [rad] of the robots in the map frame.
+        goal_poses: [N,4] of the goals' cameras.
+
+    Returns:
+        [N,4] float32: x forward, y left [m], cosine and sine of (goal yaw - robot yaw).
+    """
+    gap = goal_poses[:, :2] - poses[:, :2]
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    turn = goal_poses[:, 2] - poses[:, 2]
+    return np.stack([c * gap[:, 0] + s * gap[:, 1], c * gap[:, 1] - s * gap[:, 0],
+                     np.cos(turn), np.sin(turn)], axis=1).astype(np.float32)
+
+
+def lift(depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray) -> np.ndarray:
+    """Points of the house that pictures show, on a grid of `GRID` x `GRID` pixels.
+
+    Args:
+        depth: [K,S,S] float32 m along the optical axis, 0 where nothing is seen.
+        cameras: [K,5] x, y, z [m], yaw (left), pitch (down) [rad], as the renderer takes them.
+        fov: [K] field of view [rad].
+
+    Returns:
+        [K,GRID^2,3] float32 m in the map frame; NaN without a surface or beyond `FARTHEST`.
+    """
+    size = depth.shape[-1]
+    pixels = ((np.arange(GRID) + 0.5) * size / GRID).astype(np.int64)
+    z = depth[:, pixels[:, None], pixels[None, :]].astype(np.float64)
+    z[(z <= 0) | (z > FARTHEST)] = np.nan
+    slope = (pixels + 0.5 - size / 2) / (size / 2 / np.tan(np.asarray(fov) / 2))[:, None]
+    seen = np.stack([z, z * slope[:, None, :], z * slope[:, :, None]], axis=-1)
+    points = np.einsum('kijc,kcd->kijd', seen, _axes(cameras)) + cameras[:, None, None, :3]
+    return points.reshape(len(depth), -1, 3).astype(np.float32)
+
+
+def overlap(points: np.ndarray, depth: np.ndarray, cameras: np.ndarray,
+            fov: np.ndarray) -> np.ndarray:
+    """Share of some points that a picture shows too.
+
+    A point counts as seen where it falls into the picture and its depth agrees with that of the
+    picture, within `TOLERANCE` of it and `SLACK`: else something stands before it.
+
+    Args:
+        points: [N,P,3] m, as `lift` returns them, of the goals.
+        depth: [N,S,S]; cameras: [N,5]; fov: [N]; as for `lift`, of the robots.
+
+    Returns:
+        [N] float32 in [0, 1]; 0 where there are no points.
+    """
+    size = depth.shape[-1]
+    focal = size / 2 / np.tan(np.asarray(fov, float) / 2)
+    return _overlap(points, depth, np.ascontiguousarray(cameras[:, :3]), _axes(cameras),
+                    np.ascontiguousarray(focal))
+
+
+def _axes(cameras: np.ndarray) -> np.ndarray:
+    """Forward, right and down axes of cameras in the map frame, [K,3,3]."""
+    cy, sy, cp, sp = (f(cameras[:, k]) for k in (3, 4) for f in (np.cos, np.sin))
+    zero = np.zeros_like(cy)
+    return np.stack([np.stack([cp * cy, cp * sy, -sp], axis=1), np.stack([sy, -cy, zero], axis=1),
+                     np.stack([-sp * cy, -sp * sy, -cp], axis=1)], axis=1)
+
+
+@numba.njit(cache=True)
+def _overlap(points, depth, origin, axes, focal):
+    count, most = points.shape[:2]
+    size = depth.shape[1]
+    share = np.zeros(count, np.float32)
+    for n in range(count):
+        known, seen = 0, 0
+        for p in range(most):
+            if math.isnan(points[n, p, 0]):
+                continue
+            known += 1
+            x, y, z = (points[n, p, 0] - origin[n, 0], points[n, p, 1] - origin[n, 1],
+                       points[n, p, 2] - origin[n, 2])
+            ahead = x * axes[n, 0, 0] + y * axes[n, 0, 1] + z * axes[n, 0, 2]
+            if ahead <= 0.0:
+                continue
+            scale = focal[n] / ahead
+            column = math.floor((x * axes[n, 1, 0] + y * axes[n, 1, 1]) * scale + 0.5 * size)
+            row = math.floor((x * axes[n, 2, 0] + y * axes[n, 2, 1] + z * axes[n, 2, 2]) * scale
+                             + 0.5 * size)
+            if 0 <= column < size and 0 <= row < size:
+                gap = abs(ahead - depth[n, int(row), int(column)])
+                if gap <= TOLERANCE * ahead + SLACK:
+                    seen += 1
+        if known > 0:
+            share[n] = seen / known
+    return share
