@@ -132,7 +132,7 @@ actions:
     names = 'forward,rotate_left,rotate_right,look_up,look_down'
     run_folder = tmp_path / 'run'
     assert main(['train', '--robot', str(robot), '--actions', names, '--envs', '4', '--size', '36',
-                 '--frames', '200', '--rooms', '2', '--no-tensorboard',
+                 '--frames', '200', '--rooms', '2', '--no-tensorboard', '--pair-minutes', '0',
                  '--out', str(run_folder)]) == 0
     checkpoint = str(run_folder / 'checkpoint')
     common = ['evaluate', checkpoint, '--episodes', '4', '--max-decisions', '10']

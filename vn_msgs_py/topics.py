@@ -48,6 +48,9 @@ TOPICS = (
     Topic('odom', 'nav_msgs/msg/Odometry', 'robot', 'wheel odometry; actions are closed on it'),
     _history('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
     _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),
+    _latched('arrived', 'std_msgs/msg/Bool', 'policy',
+             'true: it says that it is where the picture was taken, and stands; false: a goal '
+             'taken'),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy', 'state and reasons'),
     _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),
     _sensor('labels/image_raw', _IMAGE, 'bridge', 'mono8 class ids'),

@@ -24,7 +24,8 @@ from vn_nav.evaluation.command import (
 from vn_nav.learning.command import add_train_options, train_config, world_options
 
 BACKENDS = ('house',)
-ENV_PRIVILEGED = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap'}
+ENV_PRIVILEGED = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap',
+                  'explorer_action'}
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 

@@ -17,6 +17,7 @@ from vn_sim_bridge import tasks
 from vn_sim_bridge.backends.base import Frames
 from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
+from vn_sim_bridge.explorer import Explorer
 from vn_sim_bridge.houses.house import CELL, interpolate
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS
 from vn_sim_bridge.houses.procedural import generate_house
@@ -27,7 +28,7 @@ from vn_sim_bridge.world import motion_noise
 
 TASKS = ('image', 'object', 'room', 'collect')
 PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
-              'overlap')
+              'overlap', 'explorer_action')
 STOPS = ('arrival', 'declared')
 TURN_COST = 0.05  # m, what the shortest-path action charges for one rotation
 BLOCKED_COST = 1.0  # per metre that a contact cuts off a forward move
@@ -113,7 +114,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     `goal_pose` [N,4] float32, the true goal's camera as the robot sees it (see
     `overlap.relative_pose`), and `overlap` [N] float32, the share of what the true goal's picture
     shows that the robot's picture shows too (see `overlap.overlap`; 0 for a blank goal). Without a
-    view to go to both are zeros.
+    view to go to both are zeros. `explorer_action` [N] int64 is what a robot would do that knows
+    only what it has seen (see `explorer`).
 
     Args:
         config: what to simulate.
@@ -171,13 +173,33 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._visited = np.zeros((n, rows, columns), bool)
         # Options that are off add nothing to the state.
         used = {'_visited': config.exploration_reward,
-                '_picture': set(config.privileged) & {'goal_pose', 'overlap'}}
+                '_picture': set(config.privileged) & {'goal_pose', 'overlap', 'explorer_action'}}
         self._state = (*self._STATE, *(name for name in used if used[name]))
+        self._explorer = self._make_explorer() if 'explorer_action' in config.privileged else None
 
     @property
     def house_index(self) -> np.ndarray:
         """[N] the house of each robot."""
         return self.backend.world.house_index
+
+    def _make_explorer(self) -> Explorer:
+        if self.config.task != 'image':
+            raise UserError('the explorer looks for the place of a picture (task image)',
+                            self.config.task, 'leave out explorer_action')
+        table = self._turning_table()
+        return Explorer(
+            self.houses, self.num_envs, fov=self.robot.camera_fov,
+            turn=self._deltas[table['rotate_left'], 2], length=self._deltas[table['forward'], 0],
+            radius=tasks.ARRIVAL_RADIUS)
+
+    def _turning_table(self) -> dict[str, int]:
+        """Numbers of the actions by name, of a robot that can turn and drive forward."""
+        table = {name: index for index, name in enumerate(self.action_names)}
+        for name in ('forward', 'rotate_left', 'rotate_right'):
+            if name not in table:
+                raise UserError('path-following actions need forward and both rotations',
+                                self.action_names, 'add them to the actions')
+        return table
 
     def _make_task(self) -> tasks.Task:
         config, common = self.config, (self.houses, self.config.num_envs)
@@ -204,7 +226,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.goals = np.full((count + 1, 3, size, size), 128, np.uint8)
         self.goal_segmentation = np.zeros((count + 1, size, size), np.uint8)
         self.blank_goal = count
-        wanted = 'overlap' in self.config.privileged
+        wanted = bool({'overlap', 'explorer_action'} & set(self.config.privileged))
         self._goal_points = np.full((count + 1 if wanted else 0, GRID * GRID, 3), np.nan,
                                     np.float32)
         for first in range(0, count, BATCH):
@@ -265,6 +287,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         houses = {'house_index': self.house_index.copy()} if self._wanders else {}
         return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed), **houses,
                 **{name.strip('_'): getattr(self, name).copy() for name in self._state},
+                **({} if self._explorer is None else {'explorer_seen': self._explorer.seen.copy(),
+                    'explorer_found': self._explorer.found.copy()}),
                 **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
                 **{f'task_{name}': part.copy() for name, part in self.task.state.items()}}
 
@@ -277,6 +301,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.backend.place(everyone, state['poses'])
         for name in self._state:
             getattr(self, name)[:] = state[name.strip('_')]
+        if self._explorer is not None:
+            self._explorer.seen[:] = state['explorer_seen']
+            self._explorer.found[:] = state['explorer_found']
         for name, part in self.backend.objects._asdict().items():
             part[:] = state[f'objects_{name}']
         for name, part in self.task.state.items():
@@ -458,9 +485,20 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             info['oracle_action'] = self.oracle_actions()
         if 'goal_pose' in self.config.privileged:
             info['goal_pose'] = self._goal_pose()
-        if 'overlap' in self.config.privileged:
+        if {'overlap', 'explorer_action'} & set(self.config.privileged):
             info['overlap'] = self._overlap(frames.depth)
+        if self._explorer is not None:
+            info['explorer_action'] = self._explore_action(reset, info['overlap'])
         return observation, info
+
+    def _explore_action(self, reset: np.ndarray, overlap: np.ndarray) -> np.ndarray:
+        """What the `Explorer` would do, [N] int64; it looks from here."""
+        self._explorer.begin(np.nonzero(reset)[0])
+        turns = self._explorer.turns(self.backend.poses, self.house_index, overlap,
+                                     self._distance, self._goal_yaw, self._maps)
+        table = self._turning_table()
+        return np.where(turns == 0, table['forward'], np.where(
+            turns > 0, table['rotate_left'], table['rotate_right']))
 
     def _goal_pose(self) -> np.ndarray:
         if not self.task.views:
@@ -484,11 +522,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if self.config.task == 'collect':
             raise UserError('the shortest-path action needs a task with a goal', 'collect',
                             'use another control')
-        table = {name: index for index, name in enumerate(self.action_names)}
-        for name in ('forward', 'rotate_left', 'rotate_right'):
-            if name not in table:
-                raise UserError('the shortest-path action needs forward and both rotations',
-                                self.action_names, 'add them to the actions')
+        table = self._turning_table()
         turn = self._deltas[table['rotate_left'], 2]
         length = self._deltas[table['forward'], 0]
         half = math.ceil(math.pi / turn)

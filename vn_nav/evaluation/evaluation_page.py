@@ -132,7 +132,8 @@ def _map(episode: Episode, plan: dict, limit: int) -> str:
     goals = [] if episode.goal_pose is None else [episode.goal_pose]
     drawn = floor_map(plan, [Journey(episode.trajectory, episode.success, episode.contacts)],
                       goals)
-    after = (f'after {episode.decisions} decisions' if episode.decisions < limit
+    count = episode.decisions
+    after = (f'after {count} decision{"s" * (count > 1)}' if count < limit
              else f'at the limit of {limit} decisions')
     return f"""<figure>{drawn}<figcaption>House {episode.scene}, to the
 {html.escape(episode.goal)}: <span class="{kind}">{outcome(episode)}</span> {after},

@@ -32,7 +32,7 @@ COLOURS = (f'{_variables(LIGHT)}\n'
            f'@media (prefers-color-scheme: dark) {{ {_variables(DARK)} }}\n')
 STYLE = COLOURS + """
 * { box-sizing:border-box } body { margin:0; background:var(--paper); color:var(--ink);
-  font:16px/1.55 system-ui, sans-serif } main { max-width:1080px;
+  font:16px/1.55 system-ui, sans-serif } main { max-width:1140px;
   margin:0 auto; padding:48px 24px }
 h1 { font-size:2.1rem; line-height:1.2; margin:0 0 .3em; letter-spacing:-.02em }
 h2 { margin:2.4em 0 .2em; font-size:1.45rem; letter-spacing:-.01em } p { max-width:68ch }
@@ -54,8 +54,9 @@ figure { margin:18px 0 } svg { width:100%; height:auto; max-height:640px; backgr
 .maps svg text { font-size:20px }
 .wide { overflow-x:auto }
 table { border-collapse:collapse; font-size:.9rem; width:100%; font-variant-numeric:tabular-nums }
-th, td { text-align:right; padding:5px 10px; border-bottom:1px solid var(--line);
+th, td { text-align:right; padding:5px 8px; border-bottom:1px solid var(--line);
   vertical-align:bottom } th { font-weight:600 } .wide td { white-space:nowrap }
+.wide table { font-size:.85rem }
 .text { text-align:left } tr.first td { font-weight:600 }
 summary { cursor:pointer; margin:14px 0 6px } dt { font-weight:600 } dd { margin:0 0 8px }
 """

@@ -41,7 +41,7 @@ def place(split: str, houses: Sequence[int]) -> str:
 
 
 def _columns(stop: str) -> tuple[Column, ...]:
-    return COLUMNS + STOP_COLUMNS if stop == DECLARED else COLUMNS
+    return COLUMNS[:1] + STOP_COLUMNS + COLUMNS[1:] if stop == DECLARED else COLUMNS
 
 
 def _rows_cells(rows: dict[str, dict], stop: str) -> tuple[list[str], list[list[str]]]:

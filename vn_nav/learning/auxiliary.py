@@ -144,6 +144,19 @@ def distance_loss(network: Policy, latents: Latents, rollout: Rollout) -> Tensor
     return masked_mean(loss, rollout.valid)
 
 
+def imitation_loss(network: Policy, latents: Latents, rollout: Rollout) -> Tensor:
+    """Cross-entropy of a teacher's actions in the states that the policy itself comes to.
+
+    The teacher must be one that the policy can follow: it knows no more than a robot could have
+    seen (`vn_sim_bridge.explorer`). Weighted down to nothing in the course of a training, so that
+    reinforcement has the last word (Ross et al. 2011; Schmitt et al., arXiv 1803.03835).
+    """
+    logits = network.actor(latents.hidden[:len(rollout.valid)])
+    action = _privileged(rollout, 'explorer_action')[:len(rollout.valid)]
+    loss = F.cross_entropy(logits.flatten(0, 1), action.flatten(), reduction='none')
+    return masked_mean(loss, rollout.valid.flatten())
+
+
 def _privileged(rollout: Rollout, key: str) -> Tensor:
     if key not in rollout.privileged:
         raise UserError(f'an auxiliary task of this training needs {key!r} in every batch',

@@ -23,11 +23,13 @@ from vn_nav.policy.network import IMAGE_HEADS, Policy, RecurrentState
 
 # Tasks whose weight is a field of `LearnerConfig`. The first three learn from the replay memory.
 REPLAY_TASKS = ('pixel_control', 'value_replay', 'reward_prediction')
-TASKS = (*REPLAY_TASKS, *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance')
+TASKS = (*REPLAY_TASKS, *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance', 'imitation')
+HEADLESS = ('value_replay', 'imitation')  # they learn through critic and actor
 # What the environment has to tell beside the observation, by task.
 PRIVILEGED = {'depth': ('depth',), 'segmentation': ('segmentation',),
               'goal_segmentation': ('goal_segmentation',), 'goal_pose': ('goal_pose', 'overlap'),
-              'arrival': ('arrived',), 'distance': ('distance',)}
+              'arrival': ('arrived',), 'distance': ('distance',),
+              'imitation': ('explorer_action',)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +50,7 @@ class LearnerConfig:
     entropy_coefficient: float = 0.01  # at the start
     final_entropy_coefficient: float = 0.005
     max_gradient_norm: float = 0.5
-    # Weights of the auxiliary tasks (thesis, table 5.1; the last four are ours).
+    # Weights of the auxiliary tasks (thesis, table 5.1; the last five are ours).
     pixel_control: float = 0.0
     value_replay: float = 0.0
     reward_prediction: float = 0.0
@@ -59,6 +61,8 @@ class LearnerConfig:
     goal_pose: float = 0.0
     arrival: float = 0.0
     distance: float = 0.0
+    imitation: float = 0.0  # at the start
+    imitation_until: float = 0.7  # share of the training at which it has fallen to 0
     # The replay memory, used by `REPLAY_TASKS`, and by the image heads if `images_from_replay`.
     images_from_replay: bool = True
     replay_steps: int = 32_000  # of all environments together
@@ -77,7 +81,7 @@ class LearnerConfig:
                 raise UserError(f'{name} is positive', value, 'correct it')
         if self.clip is not None and not self.clip > 0:
             raise UserError('clip is positive, or None', self.clip, 'correct it')
-        for name in ('gamma', 'lam', 'pixel_control_gamma', 'unrewarded'):
+        for name in ('gamma', 'lam', 'pixel_control_gamma', 'unrewarded', 'imitation_until'):
             if not 0 <= getattr(self, name) <= 1:
                 raise UserError(f'{name} lies in [0, 1]', getattr(self, name), 'correct it')
         for name in TASKS:
@@ -95,7 +99,7 @@ class LearnerConfig:
     @property
     def heads(self) -> tuple[str, ...]:
         """The heads that the network needs for them."""
-        return tuple(name for name in self.tasks if name != 'value_replay')
+        return tuple(name for name in self.tasks if name not in HEADLESS)
 
     @property
     def privileged(self) -> tuple[str, ...]:
@@ -164,6 +168,10 @@ class Learner:
             group['lr'] = rate
         entropy_coefficient = _linear(config.entropy_coefficient,
                                       config.final_entropy_coefficient, progress)
+        self._weights = {name: getattr(config, name) for name in config.tasks}
+        if 'imitation' in self._weights:
+            self._weights['imitation'] = _linear(config.imitation, 0.0,
+                                                 progress / config.imitation_until)
         if self.replay is not None:
             self.replay.extend(rollout)
         terminated, truncated = rollout.terminated, rollout.truncated
@@ -210,7 +218,7 @@ class Learner:
                 extra[name] = self._replayed_loss(name)
             else:
                 extra[name] = self._rollout_loss(name, latents, batch)
-            loss = loss + getattr(config, name) * extra[name]
+            loss = loss + self._weights[name] * extra[name]
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         parameters = [p for p in self.network.parameters() if p.grad is not None]
@@ -235,7 +243,8 @@ class Learner:
             return auxiliary.image_loss(self.network, name, latents, batch)
         if name == 'goal_pose':
             return auxiliary.goal_pose_loss(latents, batch)
-        loss = {'arrival': auxiliary.arrival_loss, 'distance': auxiliary.distance_loss}[name]
+        loss = {'arrival': auxiliary.arrival_loss, 'distance': auxiliary.distance_loss,
+                'imitation': auxiliary.imitation_loss}[name]
         return loss(self.network, latents, batch)
 
     def _replayed_loss(self, name: str) -> Tensor:

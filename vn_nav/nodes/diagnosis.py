@@ -38,7 +38,7 @@ class Diagnosis:
         self._last, self._published = (state, reason), time.monotonic()
         level, words = LEVELS.get(state, DiagnosticStatus.OK), state.value
         if reason:
-            words = f'{words}: {reason}'
+            words += f' ({reason})' if state is State.ARRIVED else f': {reason}'
         if mismatch := self._mismatched_listeners():
             level, words = DiagnosticStatus.ERROR, mismatch
         values = {'state': state.value, 'reason': reason,

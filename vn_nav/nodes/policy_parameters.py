@@ -18,6 +18,8 @@ PARAMETERS = {
     'auto_enable': (False, 'enable motion as soon as it is possible (simulators only)', None),
     'seed': (0, 'of the sampled actions', None),
     'decoding': ('', 'sample or greedy; empty: as the checkpoint was measured', None),
+    'stop_threshold': (-1.0, 'probability of arrival above which the robot stands still and says '
+                             'so, 0 to 1 (1: never); -1: as the checkpoint says', (-1.0, 1.0)),
     'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
     'frame_timeout': (0.25, 'camera silence after which the robot stands still [s]', (0.05, 5.0)),
     'frame_stop_timeout': (1.0, 'camera silence that latches a stop [s]', (0.1, 10.0)),
@@ -47,11 +49,14 @@ def read(node) -> dict:
     """All values by name.
 
     Raises:
-        UserError: a word that is none of the choices.
+        UserError: a word that is none of the choices, or a threshold that is no probability.
     """
     values = {name: node.get_parameter(name).value for name in PARAMETERS}
     for name, allowed in CHOICES.items():
         if values[name] not in allowed:
             raise UserError(f'{name} is one of {", ".join(a or "(empty)" for a in allowed)}',
                             values[name], f'set it with -p {name}:=...')
+    if -1.0 < values['stop_threshold'] < 0.0:
+        raise UserError('stop_threshold lies in [0, 1], or is -1', values['stop_threshold'],
+                        'set it with -p stop_threshold:=...')
     return values

@@ -7,6 +7,8 @@ States:
     idle      not enabled: silent.
     running   enabled: looks, decides, moves.
     hold      enabled, zero velocity until the cause is gone by itself.
+    arrived   enabled, zero velocity: the policy has declared that it is there; until another goal
+              comes, or `enable`.
     stopped   latched: zero for a second, then silent, until `reset` and `enable`.
 """
 
@@ -30,7 +32,11 @@ class State(enum.Enum):
     IDLE = 'idle'
     RUNNING = 'running'
     HOLD = 'hold'
+    ARRIVED = 'arrived'
     STOPPED = 'stopped'
+
+
+ENABLED = (State.RUNNING, State.HOLD, State.ARRIVED)
 
 
 class Phase(enum.Enum):
@@ -73,6 +79,7 @@ class Navigator:
         self.goal_ready = False
         self.velocity = np.zeros(4)
         self.decisions = 0  # in this episode
+        self.arrival: float | None = None  # probability at which arrival was declared
         self.dropped: dict[str, int] = {}  # frames by reason
         self._target = np.zeros(4)
         self._stopped_at = 0.0
@@ -109,7 +116,7 @@ class Navigator:
         """The clock went back: forget old stamps, and stand still until enabled again."""
         self._last_stamp = self._look_after = -np.inf
         self._healthy_since = None
-        if self.state in (State.RUNNING, State.HOLD):
+        if self.state in ENABLED:
             self._idle('the clock went back: enable again')
 
     def good_frame(self, now: float) -> None:
@@ -126,7 +133,7 @@ class Navigator:
         self.dropped[reason] = self.dropped.get(reason, 0) + 1
         self._bad_frames += 1
         self._healthy_since = None
-        if self._bad_frames >= 3 and self.state in (State.RUNNING, State.HOLD):
+        if self._bad_frames >= 3 and self.state in ENABLED:
             self.stop(f'three bad frames in a row: {reason}', now)
 
     # Goals.
@@ -135,9 +142,9 @@ class Navigator:
         """A goal picture came; True when it is another than the present one (a new episode)."""
         if identity == self.goal_identity:
             return False
-        self.goal_identity, self.goal_ready = identity, False
+        self.goal_identity, self.goal_ready, self.arrival = identity, False, None
         self._abandon()
-        if self.state is State.RUNNING:
+        if self.state in (State.RUNNING, State.ARRIVED):
             self.state, self.reason = State.HOLD, 'goal changed'
         return True
 
@@ -153,7 +160,10 @@ class Navigator:
     # Commands of people.
 
     def enable(self, now: float, blockers: tuple[str, ...] = ()) -> tuple[bool, str]:
-        """Allow motion; refused with everything that is missing."""
+        """Allow motion, also on from where the policy has arrived.
+
+        Refused with everything that is missing.
+        """
         missing = list(blockers)
         if self.state is State.STOPPED:
             missing.append(f'stopped ({self.reason}): call ~/reset first')
@@ -166,7 +176,8 @@ class Navigator:
             missing.append(f'frames are healthy for less than {ARMING_SECONDS:.0f} s: try again')
         if missing:
             return False, '; '.join(missing)
-        if self.state is State.IDLE:
+        self.arrival = None
+        if self.state in (State.IDLE, State.ARRIVED):
             self._abandon()
             self.state, self.reason = State.RUNNING, ''
         return True, 'enabled'
@@ -183,17 +194,17 @@ class Navigator:
         """Zero at once, latched."""
         if self.state is not State.STOPPED:
             self.state, self.reason, self._stopped_at = State.STOPPED, reason, now
+        self.arrival = None
         self._abandon()
 
     def reset(self) -> None:
         """Clear a latched stop; never enables."""
-        self._abandon()
         self._bad_frames = self._late_inferences = 0
-        self.state, self.reason = State.IDLE, 'not enabled'
+        self._idle('not enabled')
 
     def _idle(self, reason: str) -> None:
         self._abandon()
-        self.state, self.reason = State.IDLE, reason
+        self.state, self.reason, self.arrival = State.IDLE, reason, None
 
     def _abandon(self) -> None:
         """Forget the action and the decision under way; velocity zero."""
@@ -216,15 +227,37 @@ class Navigator:
 
     def decided(self, ticket: int, action: int, now: float) -> None:
         """The decision behind a ticket; discarded when it is late or no longer wanted."""
+        if self._in_time(ticket, now):
+            self._pending_action = action
+
+    def declared(self, ticket: int, probability: float, now: float) -> None:
+        """The decision behind a ticket is that the robot has arrived: zero velocity at once.
+
+        Discarded as `decided` discards; it counts as a decision.
+        """
+        if self._in_time(ticket, now):
+            self.decisions += 1
+            self._abandon()
+            self.arrival = probability
+            self._go_on()
+
+    def _in_time(self, ticket: int, now: float) -> bool:
         if ticket != self._ticket or self._inferring_since is None:
-            return
+            return False
         late = now - self._inferring_since > self.limits.inference_timeout
         self._inferring_since = None
         if late:
             self._late(now)
-            return
+            return False
         self._late_inferences = 0
-        self._pending_action = action
+        return True
+
+    def _go_on(self) -> None:
+        """With nothing in the way: drive, or stand where the policy has arrived."""
+        if self.arrival is None:
+            self.state, self.reason = State.RUNNING, ''
+        else:
+            self.state, self.reason = State.ARRIVED, f'p = {self.arrival:.2f}'
 
     def _late(self, now: float) -> None:
         self._ticket += 1
@@ -280,7 +313,7 @@ class Navigator:
             self._abandon()
             self.state, self.reason = State.HOLD, 'odometry silent'
         elif self.state is State.HOLD and self.goal_ready:
-            self.state, self.reason = State.RUNNING, ''
+            self._go_on()
 
     def _stop_and_go(self, dt: float, odometry: np.ndarray | None, stamp: float) -> np.ndarray:
         if self.phase is Phase.LOOK:

@@ -35,21 +35,32 @@ class PolicyRuntime:
         folder: a checkpoint.
         seed: of the sampled actions.
         decoding: 'sample' or 'greedy'; left out, the rule of the checkpoint's figures.
+        stop_threshold: probability of arrival above which the policy declares its stop, 0 to 1
+            (1: never); left out, the checkpoint's.
 
     Attributes:
         size: side of the square pictures [pixels].
         action_names: an action's number is its place here.
         camera_fov: field of view that the pictures have [rad].
         info: what else the checkpoint says.
+        stop_threshold: the one in force; None: the policy declares nothing.
+        arrival: probability that the robot has arrived, by the head `arrival`, at the picture
+            that `act` saw last; nan before it, and where the network has no such head.
 
     Raises:
-        UserError: see `load_checkpoint`; an unknown decoding.
+        UserError: see `load_checkpoint`; an unknown decoding; a threshold out of range, or one
+            for a network without the head `arrival`.
     """
 
-    def __init__(self, folder: str | Path, *, seed: int = 0, decoding: str | None = None):
+    def __init__(self, folder: str | Path, *, seed: int = 0, decoding: str | None = None,
+                 stop_threshold: float | None = None):
         checkpoint = load_checkpoint(folder)
         self.decoding = checkpoint.info['decoding'] if decoding is None else decoding
         _check_decoding(self.decoding)
+        self.stop_threshold: float | None = (
+            checkpoint.info['stop_threshold'] if stop_threshold is None else stop_threshold)
+        _check_stop_threshold(self.stop_threshold, checkpoint.config.heads)
+        self.arrival = math.nan
         torch.set_num_threads(1)
         self.size: int = checkpoint.config.size
         self.action_names: tuple[str, ...] = checkpoint.config.actions
@@ -65,6 +76,7 @@ class PolicyRuntime:
     def set_goal(self, goal: np.ndarray) -> None:
         """Take a goal picture, uint8 [3,S,S], encode it once, and begin an episode."""
         self._goal_maps = self._network.encode_goals(self._tensor(goal)[None])
+        self.arrival = math.nan
         self.reset()
 
     def reset(self) -> None:
@@ -72,12 +84,20 @@ class PolicyRuntime:
         self._state = self._network.initial_state(1)
         self._last_action = -1
 
+    @property
+    def arrived(self) -> bool:
+        """Whether the policy declares, at the picture that `act` saw last, that it is there."""
+        return self.stop_threshold is not None and self.arrival > self.stop_threshold
+
     @torch.inference_mode()
     def act(self, image: np.ndarray) -> int:
         """The next action for a picture, uint8 [3,S,S]; remembered as the last action.
 
+        Where the policy declares that it has `arrived` the action is not for driving: the episode
+        is over, and the next picture begins another one towards the same goal.
+
         Raises:
-            FloatingPointError: the logits are not finite; memory and last action stay.
+            FloatingPointError: the outputs are not finite; memory and last action stay.
             UserError: no goal yet, or a picture of another shape or type.
         """
         if self._goal_maps is None:
@@ -88,7 +108,14 @@ class PolicyRuntime:
         starts = torch.tensor([[self._last_action < 0]])
         output, state = self._network(observation, starts, self._state, self._goal_maps)
         action = int(choose(output.logits[0], self.decoding, self._generator))
+        if output.arrival is not None:
+            arrival = float(torch.sigmoid(output.arrival[0, 0]))
+            if not math.isfinite(arrival):
+                raise FloatingPointError('the arrival of the policy is not finite')
+            self.arrival = arrival
         self._state, self._last_action = state, action
+        if self.arrived:
+            self.reset()
         return action
 
     def _tensor(self, picture: np.ndarray) -> torch.Tensor:
@@ -155,3 +182,14 @@ class BatchedPolicy:
 def _check_decoding(decoding: str) -> None:
     if decoding not in DECODINGS:
         raise UserError('decoding is sample or greedy', decoding, 'choose one of them')
+
+
+def _check_stop_threshold(threshold: float | None, heads: tuple[str, ...]) -> None:
+    if threshold is None:
+        return
+    if not 0 <= threshold <= 1:
+        raise UserError('the stop threshold lies in [0, 1]', threshold, 'choose a value in range')
+    if threshold < 1 and 'arrival' not in heads:
+        raise UserError('a policy that declares its stop has the head arrival',
+                        f'stop threshold {threshold:g}, heads {", ".join(heads) or "none"}',
+                        'leave the threshold out, or train with the head')

@@ -1,0 +1,147 @@
+"""The worker thread of policy_node: decodes pictures, and decides when a decision is wanted."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+from sensor_msgs.msg import Image
+from std_msgs.msg import Bool, Int8, String
+
+from vn_msgs_py import images
+from vn_nav.errors import UserError
+from vn_nav.nodes.qos import qos
+from vn_nav.observation import crop_fraction, preprocess
+from vn_nav.policy.navigator import Navigator
+from vn_nav.policy.runtime import PolicyRuntime
+
+
+class DecisionWorker:
+    """Pictures and goals in, decisions and the statement `arrived` out.
+
+    Args:
+        node: that publishes `action`, `action_names` and `arrived`.
+        navigator: wants the decisions.
+        runtime: makes them; only the thread in `run` uses it.
+        wake: guards the navigator and what this object keeps.
+        is_running: false ends `run`.
+        lock_step: frames stamped up to the goal's stamp belong to the episode before.
+
+    Attributes:
+        camera_fov: field of view of the camera [rad], as far as it is known.
+        publishers: what `create_publisher` made.
+    """
+
+    def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
+                 wake: threading.Condition, is_running: Callable[[], bool], *, lock_step: bool):
+        self._node, self._navigator, self._runtime = node, navigator, runtime
+        self._wake, self._is_running, self._lock_step = wake, is_running, lock_step
+        self.camera_fov: float | None = None
+        self._frame: tuple | None = None  # the newest message and its stamp
+        self._goal: Image | None = None
+        self._said: bool | None = None  # on `arrived`
+        self._action, names, self._arrived = self.publishers = [
+            node.create_publisher(kind, name, qos(name)) for kind, name in (
+                (Int8, 'action'), (String, 'action_names'), (Bool, 'arrived'))]
+        names.publish(String(data=json.dumps(list(runtime.action_names))))
+        self.tell_arrival()
+
+    def show_frame(self, message, stamp: float) -> None:
+        """The newest admitted picture; one before it that still waits is dropped."""
+        with self._wake:
+            self._frame = (message, stamp)
+            self._wake.notify_all()
+
+    def show_goal(self, message: Image) -> None:
+        """The newest goal picture."""
+        with self._wake:
+            self._goal = message
+            self._wake.notify_all()
+
+    def check_fov(self) -> None:
+        """Raise UserError where the camera sees less than the policy needs."""
+        if self.camera_fov is not None:
+            crop_fraction(self.camera_fov, self._runtime.camera_fov)
+
+    def tell_arrival(self, *, again: bool = False) -> None:
+        """Publish whether the robot stands where the policy has arrived, when that changed.
+
+        Args:
+            again: also when it did not: a new goal is answered with a statement.
+        """
+        with self._wake:
+            arrived = self._navigator.arrival is not None
+            if again or arrived != self._said:
+                self._said = arrived
+                self._arrived.publish(Bool(data=arrived))
+
+    def run(self) -> None:
+        """Decode every admitted frame, until the node does not run any more."""
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: not self._is_running() or self._frame or self._goal)
+                if not self._is_running():
+                    return
+                goal, self._goal = self._goal, None
+                frame, self._frame = self._frame, None
+            if goal is not None:
+                self._take_goal(goal)
+            if frame is not None:
+                self._take_frame(*frame)
+
+    def _take_goal(self, message: Image) -> None:
+        try:
+            # A goal picture comes from a camera like this one; it is cropped the same way.
+            picture = self._prepare(message)
+        except (images.ImageError, UserError) as error:
+            self._node.get_logger().error(f'goal_image refused: {error}')
+            with self._wake:
+                self._navigator.refuse_goal()
+            return
+        self._runtime.set_goal(picture)
+        with self._wake:
+            if self._goal is None:  # else a newer one is waiting
+                stamp = message.header.stamp
+                self._navigator.accept_goal(stamp.sec + stamp.nanosec * 1e-9 if self._lock_step
+                                            else -math.inf)
+                self.tell_arrival(again=True)
+
+    def _take_frame(self, message, stamp: float) -> None:
+        try:
+            picture = self._prepare(message)
+        except (images.ImageError, UserError) as error:
+            with self._wake:
+                self._navigator.bad_frame(str(error), time.monotonic())
+            return
+        with self._wake:
+            now = time.monotonic()
+            self._navigator.good_frame(now)
+            ticket = self._navigator.request(stamp, now)
+        if ticket is None:
+            return
+        try:
+            action = self._runtime.act(picture)
+        except FloatingPointError as error:
+            with self._wake:
+                self._navigator.stop(str(error), time.monotonic())
+                self._wake.notify_all()
+            return
+        if not self._runtime.arrived:
+            self._action.publish(Int8(data=action))
+        with self._wake:
+            now = time.monotonic()
+            if self._runtime.arrived:
+                self._navigator.declared(ticket, self._runtime.arrival, now)
+                self.tell_arrival()
+            else:
+                self._navigator.decided(ticket, action, now)
+            self._wake.notify_all()
+
+    def _prepare(self, message) -> np.ndarray:
+        fov = {} if self.camera_fov is None else {
+            'fov': self.camera_fov, 'target_fov': self._runtime.camera_fov}
+        return preprocess(images.decode_rgb(message), self._runtime.size, **fov)
