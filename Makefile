@@ -4,6 +4,7 @@
 #   make demo      watch a robot drive to the places of pictures, in simulation, over ROS 2
 #   make test      the fast tests (under 5 minutes)
 #   make test-all  every test (under 40 minutes)
+#   make soak      kill trainings at 200 random moments (about half an hour)
 #   make lint      ruff, and the linters of ROS
 #   make clean     remove what was built: the environment, caches, the demonstration's output
 #
@@ -28,7 +29,7 @@ export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 export FASTRTPS_DEFAULT_PROFILES_FILE := $(CURDIR)/config/fastdds_localhost.xml
 export ROS_AUTOMATIC_DISCOVERY_RANGE := SYSTEM_DEFAULT
 
-.PHONY: demo test test-all lint clean
+.PHONY: demo test test-all soak lint clean
 
 demo: $(READY)
 	@$(BIN)/vn_nav demo
@@ -38,6 +39,10 @@ test: $(READY)
 
 test-all: $(READY_ALL)
 	@$(BIN)/python -m pytest --durations=20
+
+# `make test-all` kills 20 times.
+soak: $(READY)
+	@VN_NAV_KILLS=200 $(BIN)/python -m pytest test/test_survival.py -k loses_no_committed_update
 
 lint: $(READY)
 	@$(BIN)/python -m ruff check .
@@ -64,7 +69,7 @@ $(READY): setup.py constraints.txt
 	@echo "Setting up $(VENV) (ROS 2 Jazzy wheels, PyTorch, tools): once, one to five minutes."
 	@[ "$$($(BIN)/python -c 'import pip, sys; print(sys.prefix)' 2>/dev/null)" = "$(CURDIR)/$(VENV)" ]\
 	 || $(PYTHON) -m venv --clear $(VENV)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,test]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,onnx,test]'
 	@touch $@
 
 # The GPU kernels run in Warp's CPU mode too, but only some tests need its 400 MB.

@@ -83,6 +83,7 @@ setup(
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'train': ['tensorboard>=2.16'],
         'mesh': ['trimesh>=4.5', 'pillow>=10'],  # OBJ, GLB and glTF in and out
+        'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels
         'test': [
             'pytest>=8',

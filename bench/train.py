@@ -88,6 +88,9 @@ def our_network(env) -> Policy:
 def plain_weights(network: Policy) -> dict:
     """Our weights under the names, and in the layout, of `PlainNetwork`."""
     own = network.state_dict()
+    side = map_side(network.config.size)  # our trunk reads the maps as [row, column, channel]
+    own['encoder.trunk.weight'] = own['encoder.trunk.weight'].view(
+        FEATURES, side, side, -1).permute(0, 3, 1, 2).flatten(1)
 
     def gates(rows):  # input, forget, output, cell -> input, forget, cell, output
         i, f, o, g = rows.chunk(4)
@@ -183,12 +186,12 @@ def main():
     sample = make_sample()
     env = StackedEnv(make_env())
     plain = PlainNetwork(env.count, map_side(env.env.config.size))
-    differences = {'plain loop': plain_difference(plain, sample)}
+    differences = {'CleanRL-style loop': plain_difference(plain, sample)}
     ours = {'fp32': Ours(torch.float32), 'bf16': Ours(torch.bfloat16)}
     loop = PlainLoop(env, plain)
     for warm in (*ours.values(), loop):
         rate(warm)
-    runs = {'fp32': lambda: rate(ours['fp32']), 'plain loop': lambda: rate(loop),
+    runs = {'fp32': lambda: rate(ours['fp32']), 'CleanRL-style loop': lambda: rate(loop),
             'bf16': lambda: rate(ours['bf16'])}
     if arguments.peers.exists():
         with tempfile.NamedTemporaryFile(suffix='.pt') as file:
@@ -199,6 +202,9 @@ def main():
     else:
         print(f'bench/train.py: no RecurrentPPO ({arguments.peers}, see bench/requirements.txt)',
               file=sys.stderr)
+    for name, difference in differences.items():
+        if not difference < 1e-4:
+            sys.exit(f'bench/train.py: the network of {name} differs from ours by {difference}')
     values = {name: [] for name in runs}
     for _ in range(arguments.rounds):
         for name, run in runs.items():

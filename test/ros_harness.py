@@ -1,6 +1,7 @@
 """Real nodes in child processes for the two-process tests."""
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -15,13 +16,22 @@ from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.world import WORLD_VERSION
 
 
-def write_checkpoint(folder, size=84, seed=0):
-    """A small real checkpoint with seeded random weights: nearly uniform actions."""
+def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=None):
+    """A small real checkpoint with seeded random weights: nearly uniform actions.
+
+    With `arrival` it has that head, which says this probability of whatever it sees.
+    """
     torch.manual_seed(seed)
     network = Policy(NetworkConfig(actions=DRIVE_ACTIONS, size=size, channels=(4, 4, 4),
-                                   features=16, hidden=16))
+                                   features=16, hidden=16,
+                                   heads=() if arrival is None else ('arrival',)))
+    if arrival is not None:
+        layer = network.heads['arrival'].out
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.constant_(layer.bias, math.log(arrival / (1 - arrival)))
     save_checkpoint(folder, network, {'world_version': WORLD_VERSION, 'camera_fov_deg': 90.0,
-                                      'camera_height': 1.0, 'houses': [7], 'rooms': 5})
+                                      'camera_height': 1.0, 'houses': [7], 'rooms': 5,
+                                      'stop_threshold': stop_threshold})
     return folder
 
 

@@ -14,19 +14,22 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from ros_harness import child, wait_until, write_checkpoint
 from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import String
+from std_msgs.msg import Bool, Float32, String, UInt8
 from std_srvs.srv import Trigger
 
 from vn_msgs_py.images import decode_rgb
-from vn_msgs_py.motion import odometry_to_array
+from vn_msgs_py.motion import fill_twist, odometry_to_array
 from vn_nav.bags.reader import read_bag
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.nodes.qos import qos
 from vn_nav.resources import share_file
+from vn_nav.robot import RobotSpec
 from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.simulated_robot import TERMINATED, TICK, SimulatedRobot
 from vn_sim_bridge.tasks import wrap_angle
 
 pytestmark = pytest.mark.ros
+OUTCOMES = {'reward': Float32, 'episode_end': UInt8, 'episode_result': String}
 
 
 class Listener:
@@ -39,10 +42,12 @@ class Listener:
         self.heard = {}
         for name, kind in (('odom', Odometry), ('ground_truth/odom', Odometry),
                            ('image_raw', Image), ('goal_image', Image), ('scene', String),
-                           ('episode', String), ('camera_info', CameraInfo)):
+                           ('episode', String), ('camera_info', CameraInfo),
+                           *OUTCOMES.items()):
             self.heard[name] = []
             self.node.create_subscription(kind, name, self.heard[name].append, qos(name, depth=50))
         self.command = self.node.create_publisher(Twist, 'cmd_vel', qos('cmd_vel'))
+        self.arrived = self.node.create_publisher(Bool, 'arrived', qos('arrived'))
 
     def spin(self):
         self.executor.spin_once(timeout_sec=0.01)
@@ -50,6 +55,21 @@ class Listener:
     def pause(self, seconds):
         end = time.monotonic() + seconds
         wait_until(lambda: time.monotonic() > end, self.spin)
+
+    def hears(self, name, count):
+        """Wait for so many messages on a topic; the newest."""
+        wait_until(lambda: len(self.heard[name]) >= count, self.spin, 20)
+        assert len(self.heard[name]) == count
+        return self.heard[name][-1]
+
+    def drive(self, delta):
+        """One decision in lock-step: a displacement in a single tick, then rest."""
+        velocity, rewards = np.asarray(delta) / TICK, len(self.heard['reward'])
+        self.command.publish(fill_twist(Twist(), velocity))
+        wait_until(lambda: self.pose('odom')[3:6].any(), self.spin, 20)
+        self.command.publish(Twist())
+        wait_until(lambda: not self.pose('odom')[3:6].any(), self.spin, 20)
+        return self.hears('reward', rewards + 1).data
 
     def pose(self, name='ground_truth/odom'):
         return odometry_to_array(self.heard[name][-1])
@@ -66,7 +86,8 @@ def listener():
 
 def test_any_twist_drives_it_and_silence_stops_it(listener, tmp_path):
     with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7, noise=False):
-        wait_until(lambda: all(listener.heard.values()), listener.spin)
+        wait_until(lambda: all(heard for name, heard in listener.heard.items()
+                               if name not in OUTCOMES), listener.spin)
         scene = json.loads(listener.heard['scene'][0].data)
         assert scene['house'] == 7 and len(scene['goals']) == 5
         assert decode_rgb(listener.heard['image_raw'][-1]).shape == (84, 84, 3)
@@ -117,13 +138,95 @@ def test_reset_takes_the_goal_pose_and_refuses_a_wall(listener, tmp_path):
 
 def test_bad_parameters_are_one_line_and_exit_code_2():
     for parameter, word in (('backend:=thor', 'backend'), ('house:=-3', 'seed'),
-                            ('time:=yesterday', 'time'), ('rooms:=40', 'rooms')):
+                            ('stop:=never', 'stop'), ('time:=yesterday', 'time'),
+                            ('rooms:=40', 'rooms')):
         done = subprocess.run(
             [sys.executable, '-m', 'vn_sim_bridge.bridge_node', '--ros-args', '-p', parameter],
             capture_output=True, text=True, timeout=60)
         assert done.returncode == 2, done.stderr
         assert len(done.stderr.strip().splitlines()) == 1, done.stderr
         assert word in done.stderr
+
+
+@pytest.fixture(scope='module')
+def journey():
+    """`NavigationEnv` with declared stops: the oracle's way, and a false stop at once.
+
+    Displacements of the first robot's decisions; whether it could have declared after each; and
+    the decisions of both episodes, the declaration included.
+    """
+    env = NavigationEnv(EnvConfig(houses=(7,), num_envs=2, noise=False, stop='declared'))
+    _, info = env.reset(seed=5)
+    deltas, arrived = [], []
+    while True:
+        actions = [env.oracle_actions()[0], env.declare_action]
+        _, reward, ended, _, info = env.step(actions)
+        if not deltas:
+            assert ended[1] and not info['success'][1] and reward[1] == 0.0
+            false_stop = int(info['decisions'][1])
+        if ended[0]:
+            assert info['success'][0] and reward[0] == 1.0
+            return deltas, arrived, int(info['decisions'][0]), false_stop
+        deltas.append(env._deltas[actions[0]])
+        arrived.append(bool(info['arrived'][0]))
+
+
+def test_a_declared_stop_is_judged_as_navigation_env_judges_it(journey):
+    deltas, arrived, decisions, false_stop = journey
+    robot = SimulatedRobot(7, 5, robot=RobotSpec(), noise=False, seed=5, stop='declared')
+    episode = robot.begin_episode(0)
+    for delta in deltas:
+        assert robot.tick(delta / TICK) is None
+        judged = robot.tick(np.zeros(4))
+        assert (judged.success, judged.end) == (False, 0)  # arriving alone is nothing
+    assert arrived[-1] and not any(arrived[:-1])
+    judged = robot.declare()
+    assert (judged.success, judged.end, judged.collided) == (True, TERMINATED, False)
+    assert episode.decisions == decisions == len(deltas) + 1
+    episode = robot.begin_episode(1)
+    judged = robot.declare()
+    assert (judged.success, judged.end) == (False, TERMINATED)
+    assert episode.decisions == false_stop == 1
+
+
+def test_the_robot_ends_the_episode_when_stops_are_declared(listener, journey, tmp_path):
+    deltas, _, decisions, _ = journey
+
+    def say(arrived):
+        listener.arrived.publish(Bool(data=arrived))
+
+    def result():
+        return json.loads(listener.heard['episode_result'][-1].data)
+    with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7, noise=False, seed=5,
+               time='lock_step', stop='declared', episodes=3, exit_when_done=True) as bridge:
+        wait_until(lambda: listener.heard['odom'] and listener.heard['episode']
+                   and listener.arrived.get_subscription_count()
+                   and listener.command.get_subscription_count(), listener.spin)
+        say(False)  # the goal is taken
+        for delta in deltas:
+            assert listener.drive(delta) == 0.0
+        listener.pause(0.3)
+        assert not listener.heard['episode_end'], 'it stands at the goal and has not said so'
+        say(True)
+        assert listener.hears('episode_end', 1).data == 1
+        assert listener.heard['reward'][-1].data == 1.0
+        listener.hears('episode_result', 1)
+        assert result()['success'] and result()['decisions'] == decisions
+        say(True)  # as if it still meant the goal before
+        listener.pause(0.5)
+        assert len(listener.heard['episode_end']) == 1
+        say(False)
+        say(True)
+        assert listener.hears('episode_end', 2).data == 1
+        assert listener.heard['reward'][-1].data == 0.0
+        listener.hears('episode_result', 2)
+        assert not result()['success'] and result()['decisions'] == 1
+        listener.hears('episode', 3)
+        said = time.monotonic()
+        say(True)  # nobody takes it back: it is meant
+        assert listener.hears('episode_end', 3).data == 1
+        assert time.monotonic() - said > 1.0
+        assert bridge.wait(20) == 0
 
 
 def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):

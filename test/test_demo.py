@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from ros_harness import write_checkpoint
 from rosbags.highlevel import AnyReader
 
 from vn_nav.cli import main
@@ -67,6 +68,23 @@ def test_every_figure_is_in_the_bag(demo):
         assert figures['collisions'] == pytest.approx(
             sum(e[3] for e in own) / sum(e[2] for e in own))
         assert figures['random']['episodes'] == count
+
+
+def test_declared_stops_are_counted_from_the_bag(tmp_path):
+    sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
+    assert main(['demo', '--out', str(tmp_path / 'out'), '--checkpoint', str(sure),
+                 '--episodes', '2', '--unseen-episodes', '1']) == 0
+    result = json.loads((tmp_path / 'out' / 'result.json').read_text())
+    for place in ('trained', 'unseen'):
+        for figures in (result[place], result[place]['without_ros']):
+            assert (figures['success'], figures['declared'], figures['false_stops'],
+                    figures['reached'], figures['decisions']) == (0, 1, 1, 0, 1)
+        assert result[place]['stop'] == 'declared' and 'declared' in result[place]['random']
+    with AnyReader([tmp_path / 'out' / 'bag']) as reader:
+        said = [reader.deserialize(data, connection.msgtype).data
+                for connection, _, data in reader.messages(
+                    [c for c in reader.connections if c.topic == '/arrived'])]
+    assert sum(said) == 3 and said[-1]
 
 
 def test_the_page_is_whole_and_needs_nothing_else(demo):

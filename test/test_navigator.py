@@ -221,7 +221,103 @@ def test_nobody_drives_blind_when_odometry_falls_silent(rig):
 def test_a_clock_that_goes_back_disarms(rig):
     rig.arm()
     rig.navigator.time_jumped()
-    assert rig.step() is None and rig.navigator.state is State.IDLE
+    assert not rig.step().any() and rig.navigator.state is State.IDLE
+
+
+def test_disabling_in_motion_sends_zeros_before_the_silence(rig):
+    assert rig.step() is None  # never enabled: nothing to take back
+    rig.arm()
+    while not rig.step().any():
+        rig.decide()
+    rig.navigator.disable()
+    sent = [rig.step() for _ in range(int(1.5 / DT))]
+    zeros = [velocity for velocity in sent if velocity is not None]
+    assert len(zeros) >= 0.9 / DT and not np.any(zeros)
+    assert sent[0] is not None and sent[-1] is None
+
+
+def declare(rig, probability=0.93):
+    """Frames until a decision is wanted; then the policy says that it has arrived."""
+    while (ticket := rig.frame_later()) is None:
+        pass
+    rig.navigator.declared(ticket, probability, rig.now + 0.01)
+
+
+@pytest.mark.parametrize('continuous', [False, True])
+def test_a_declared_arrival_stands_until_there_is_another_goal(continuous):
+    rig = Rig(continuous=continuous)
+    rig.arm()
+    if continuous:
+        rig.decide()
+        assert rig.step().any()
+    declare(rig)
+    assert rig.navigator.state is State.ARRIVED and rig.navigator.reason == 'p = 0.93'
+    assert rig.navigator.decisions == 1 + continuous  # standing still is a decision
+    for _ in range(60):
+        assert rig.frame_later() is None  # nothing is decided
+        assert np.array_equal(rig.step(), np.zeros(4))
+    assert not rig.navigator.new_goal((1, 0))  # the same picture again
+    assert rig.navigator.state is State.ARRIVED
+    assert rig.navigator.new_goal((2, 0)) and rig.navigator.arrival is None
+    rig.navigator.accept_goal(-np.inf)
+    rig.decide()
+    assert rig.step().any() and rig.navigator.decisions == 1
+
+
+def test_enabling_again_goes_on_from_where_it_arrived(rig):
+    rig.arm()
+    declare(rig)
+    assert rig.navigator.enable(rig.now)[0]
+    assert rig.navigator.state is State.RUNNING and rig.navigator.arrival is None
+    rig.decide()
+    assert rig.step().any()
+
+
+def test_camera_and_odometry_are_watched_where_it_arrived(rig):
+    rig.arm()
+    declare(rig)
+    rig.now += DT
+    assert not rig.navigator.step(rig.now, DT, ODOMETRY, rig.now, odometry_lost=True).any()
+    assert rig.navigator.state is State.HOLD and 'odometry' in rig.navigator.reason
+    rig.step()
+    assert rig.navigator.state is State.ARRIVED, 'a healed fault is no reason to drive on'
+    for _ in range(8):
+        rig.step()
+    assert rig.navigator.state is State.HOLD and 'camera' in rig.navigator.reason
+    rig.frame()
+    rig.step()
+    assert rig.navigator.state is State.ARRIVED and rig.navigator.reason == 'p = 0.93'
+    for _ in range(25):
+        rig.step()
+    assert rig.navigator.state is State.STOPPED
+
+
+@pytest.mark.parametrize('order, state', [
+    (lambda navigator, now: navigator.stop('~/stop was called', now), State.STOPPED),
+    (lambda navigator, now: navigator.disable(), State.IDLE),
+    (lambda navigator, now: navigator.reset(), State.IDLE),
+    (lambda navigator, now: navigator.time_jumped(), State.IDLE)])
+def test_orders_of_people_come_before_arrival(rig, order, state):
+    rig.arm()
+    ticket = None
+    while ticket is None:
+        ticket = rig.frame_later()
+    order(rig.navigator, rig.now)
+    rig.navigator.declared(ticket, 0.93, rig.now)  # too late to say so
+    assert rig.navigator.state is state and rig.navigator.arrival is None
+    rig.navigator.reset()
+    rig.arm()
+    declare(rig)
+    order(rig.navigator, rig.now)
+    assert rig.navigator.state is state and rig.navigator.arrival is None
+
+
+def test_a_late_declaration_is_discarded(rig):
+    rig.arm()
+    while (ticket := rig.frame_later()) is None:
+        pass
+    rig.navigator.declared(ticket, 0.93, rig.now + 0.2)
+    assert rig.navigator.state is State.RUNNING and rig.navigator.decisions == 0
 
 
 def test_continuous_mode_decides_in_motion():

@@ -14,11 +14,14 @@ from geometry_msgs.msg import Twist
 from rclpy.executors import SingleThreadedExecutor
 from ros_harness import child, wait_until, write_checkpoint
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import twist_to_array
+from vn_nav.errors import UserError
 from vn_nav.nodes.qos import qos
+from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.robot import RobotSpec
 
 pytestmark = pytest.mark.ros
@@ -34,7 +37,8 @@ class Camera:
         self.image = self.node.create_publisher(Image, 'image_raw', qos('image_raw'))
         self.info = self.node.create_publisher(CameraInfo, 'camera_info', qos('camera_info'))
         self.goal = self.node.create_publisher(Image, 'goal_image', qos('goal_image'))
-        self.commands, self.reasons = [], []
+        self.commands, self.reasons, self.arrived = [], [], []
+        self.node.create_subscription(Bool, 'arrived', self._hear_arrived, qos('arrived'))
         self.node.create_subscription(Twist, 'cmd_vel', self._hear, qos('cmd_vel', depth=100))
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnose,
                                       qos('/diagnostics'))
@@ -43,6 +47,9 @@ class Camera:
 
     def _hear(self, message):
         self.commands.append((time.monotonic(), twist_to_array(message)))
+
+    def _hear_arrived(self, message):
+        self.arrived.append(message.data)
 
     def _diagnose(self, message):
         self.reasons.append(message.status[0].message)
@@ -144,6 +151,58 @@ def test_it_drives_within_limits_and_stops_when_the_camera_falls_silent(
         wait_until(lambda: not camera.moving(), camera.spin, 0.3)
 
 
+def test_what_the_policy_declares(tmp_path):
+    sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
+    picture = np.zeros((3, 84, 84), np.uint8)
+    for threshold, in_force, arrived in ((None, 0.5, True), (0.95, 0.95, False), (1, 1, False)):
+        runtime = PolicyRuntime(sure, stop_threshold=threshold)
+        assert runtime.stop_threshold == in_force
+        runtime.set_goal(picture)
+        assert np.isnan(runtime.arrival) and not runtime.arrived
+        runtime.act(picture)
+        assert runtime.arrival == pytest.approx(0.93) and runtime.arrived == arrived
+    silent = PolicyRuntime(write_checkpoint(tmp_path / 'silent', arrival=0.93))
+    headless = PolicyRuntime(write_checkpoint(tmp_path / 'headless'))
+    for runtime in (silent, headless):
+        runtime.set_goal(picture)
+        runtime.act(picture)
+        assert runtime.stop_threshold is None and not runtime.arrived
+    assert silent.arrival == pytest.approx(0.93) and np.isnan(headless.arrival)
+    with pytest.raises(UserError, match='head arrival'):
+        PolicyRuntime(tmp_path / 'headless', stop_threshold=0.5)
+    with pytest.raises(UserError, match=r'\[0, 1\]'):
+        PolicyRuntime(sure, stop_threshold=1.5)
+
+
+@pytest.mark.parametrize('mode', ['stop_and_go', 'continuous'])
+def test_a_declared_arrival_stands_still_and_says_so(camera, tmp_path, mode):
+    sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
+    with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=sure, mode=mode):
+        camera.enable()
+        wait_until(lambda: camera.arrived and camera.arrived[-1], camera.spin)
+        wait_until(lambda: 'arrived (p = 0.93)' in camera.reasons, camera.spin, 3)
+        statements = len(camera.arrived)
+        end = time.monotonic() + 1
+        wait_until(lambda: time.monotonic() > end, camera.spin)
+        assert len(camera.arrived) == statements, 'said once'
+        camera.show_goal()  # another one: it takes it, looks, and says so again
+        wait_until(lambda: camera.arrived[statements:] == [False, True], camera.spin, 5)
+        assert camera.call(SetBool, 'enable', data=True).success
+        wait_until(lambda: camera.arrived[statements + 2:] == [False, True], camera.spin, 5)
+        assert camera.call(SetBool, 'enable', data=False).success
+        wait_until(lambda: not camera.arrived[-1], camera.spin, 3)
+        assert camera.commands and not any(v.any() for _, v in camera.commands)
+
+
+def test_the_parameter_is_stronger_than_the_checkpoint(camera, tmp_path):
+    sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
+    with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=sure,
+               stop_threshold=0.95):
+        camera.enable()
+        wait_until(camera.moving, camera.spin)
+        assert camera.arrived and not any(camera.arrived)
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signals_deliver_zero(camera, checkpoint, tmp_path, number):
     with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=checkpoint) as process:
@@ -181,6 +240,7 @@ def test_a_second_publisher_and_a_narrow_camera_are_refused(camera, checkpoint, 
     (['-p', 'checkpoint:=/nowhere'], 'checkpoint'),
     (['-p', 'robot:=/nowhere.yaml'], 'robot file'),
     (['-p', 'mode:=sideways'], 'mode'),
+    (['-p', 'stop_threshold:=-0.5'], 'stop_threshold'),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(parameters, word):
     done = subprocess.run([sys.executable, '-m', 'vn_nav.nodes.policy_node', '--ros-args',

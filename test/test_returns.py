@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from vn_nav.learning.returns import generalised_advantages, n_step_q, n_step_returns
+from vn_nav.learning.returns import (
+    generalised_advantages,
+    n_step_q,
+    n_step_returns,
+    normalise,
+)
 from vn_nav.policy.heads import dueling
 
 STEPS, ENVS = 24, 7
@@ -50,6 +55,27 @@ def test_returns_equal_a_naive_loop(seed):
             if parts[4][t, env]:
                 assert float(fast[t, env]) == pytest.approx(
                     naive_return(t, env, *parts, 0.9), abs=1e-5)
+
+
+def test_advantages_equal_a_naive_loop():
+    reward, value, terminated, truncated, valid = rollout(3)
+    fast = generalised_advantages(reward, value, terminated, truncated, gamma=0.9, lam=0.8)
+    for env in range(ENVS):
+        for t in range(STEPS):
+            total, weight = 0.0, 1.0
+            for k in range(t, STEPS):
+                follows = 0.0 if terminated[k, env] else 0.9 * float(value[k + 1, env])
+                total += weight * (float(reward[k, env]) + follows - float(value[k, env]))
+                if terminated[k, env] or truncated[k, env]:
+                    break
+                weight *= 0.9 * 0.8
+            assert not valid[t, env] or float(fast[t, env]) == pytest.approx(total, abs=1e-5)
+
+
+def test_masked_rows_do_not_count_even_when_they_are_nan():
+    x = torch.tensor([1.0, 3.0, float('nan')])
+    assert torch.allclose(normalise(x, torch.tensor([True, True, False]))[:2],
+                          torch.tensor([-1.0, 1.0]), atol=1e-4)
 
 
 def test_returns_equal_monte_carlo_advantages_plus_value():

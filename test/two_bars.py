@@ -12,16 +12,17 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from vn_nav.learning.learner import PRIVILEGED
 from vn_nav.learning.rollout import Collector
 from vn_nav.policy.network import Policy
 from vn_nav.policy.runtime import BatchedPolicy
 
 ACTIONS = ('left', 'right', 'wait')
 LIMIT = 4  # decisions
-RED, GREEN = (200, 40, 40), (40, 200, 40)
+RED, GREEN = (235, 0, 0), (0, 235, 0)
 RIGHT, BLANK = 'right', 'blank'
-KEYS = tuple(dict.fromkeys(key for keys in PRIVILEGED.values() for key in keys))
+# All that auxiliary tasks may ask for.
+KEYS = ('depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap', 'arrived',
+        'distance', 'explorer_action', 'oracle_action')
 
 
 class TwoBars:
@@ -77,9 +78,7 @@ class TwoBars:
         reset, acting = self.done.copy(), ~self.done
         self._begin(np.nonzero(reset)[0])
         turned = acting & (actions < 2)
-        # The red bar is wanted and on the left, or neither.
-        wanted = np.where((self.goal == 0) == self.red_left, 0, 1)
-        success = turned & (actions == wanted)
+        success = turned & (actions == self._wanted())
         self.facing[turned] = 1 + np.asarray(actions)[turned]
         self.step_count[acting] += 1
         self.last_action[acting] = np.asarray(actions)[acting]
@@ -94,9 +93,13 @@ class TwoBars:
         n = len(env_ids)
         self.red_left[env_ids] = self.random.integers(0, 2, n) > 0
         self.goal[env_ids] = self.random.integers(0, 2, n)
-        self.grey[env_ids] = self.random.integers(90, 160, n)
+        self.grey[env_ids] = self.random.integers(110, 140, n)
         self.step_count[env_ids] = self.facing[env_ids] = 0
         self.last_action[env_ids], self.last_reward[env_ids] = -1, 0.0
+
+    def _wanted(self) -> np.ndarray:
+        """[N] the right turn: the red bar is wanted and on the left, or neither."""
+        return np.where((self.goal == 0) == self.red_left, 0, 1)
 
     def _labels(self) -> np.ndarray:
         """[N,S,S] 0 nothing, 1 red, 2 green."""
@@ -125,8 +128,8 @@ class TwoBars:
         observation = {'image': (image + noise).astype(np.uint8), 'goal_index': shown,
                        'last_action': self.last_action.copy(),
                        'last_reward': self.last_reward.copy()}
-        left = (self.goal == 0) == self.red_left
-        side = np.where(self.facing > 0, 0, np.where(left, 1, -1)).astype(np.float32)
+        wanted = self._wanted()
+        side = np.where(self.facing > 0, 0, 1 - 2 * wanted).astype(np.float32)
         pose = np.stack([1.0 - np.abs(side), side, 1.0 - np.abs(side), side], axis=1)
         info = {'reset': reset, 'success': success, 'collided': np.zeros(self.num_envs, bool),
                 'depth': np.where(labels > 0, 1.0, 4.0).astype(np.float32),
@@ -134,7 +137,8 @@ class TwoBars:
                 'goal_pose': pose.astype(np.float32),
                 'overlap': np.where((self.facing == 0) | success, 1.0, 0.0).astype(np.float32),
                 'arrived': success.copy(),
-                'distance': np.where(success, 0.0, 1.0).astype(np.float32)}
+                'distance': np.where(success, 0.0, 1.0).astype(np.float32),
+                'explorer_action': wanted, 'oracle_action': wanted.copy()}
         return observation, info
 
 

@@ -49,8 +49,8 @@ TOPICS = (
     _history('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
     _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),
     _latched('arrived', 'std_msgs/msg/Bool', 'policy',
-             'true: it says that it is where the picture was taken, and stands; false: a goal '
-             'taken'),
+             'true: it says that it has arrived, and stands still; false: it does not, said anew '
+             'of every goal'),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy', 'state and reasons'),
     _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),
     _sensor('labels/image_raw', _IMAGE, 'bridge', 'mono8 class ids'),

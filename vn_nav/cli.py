@@ -25,7 +25,8 @@ from vn_nav.learning.command import add_train_options, train_config, world_optio
 
 BACKENDS = ('house',)
 ENV_PRIVILEGED = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap',
-                  'explorer_action'}
+                  'explorer_action', 'oracle_action'}
+STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
@@ -68,6 +69,12 @@ def build_parser() -> argparse.ArgumentParser:
     publish.add_argument('--robot', type=Path, metavar='YAML', help='that it was trained for')
     publish.set_defaults(run=run_publish)
 
+    export = commands.add_parser('export', help='write a checkpoint as ONNX')
+    export.add_argument('checkpoint', type=Path)
+    export.add_argument('--onnx', type=Path, required=True, metavar='FOLDER',
+                        help='for policy.onnx and goal.onnx')
+    export.set_defaults(run=run_export)
+
     house = commands.add_parser('house', help='look at an embedded house')
     actions = house.add_subparsers(dest='action', required=True, metavar='ACTION')
     for name, words, run, out in (
@@ -105,14 +112,38 @@ def _check_backend(name: str) -> None:
 
 
 def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, threads: int = 1,
-             randomisation: str | Path = 'none', **options):
-    """A `NavigationEnv` of embedded houses; without a robot file with the standard robot."""
+             randomisation: str | Path = 'none', device: str = 'cpu', **options):
+    """A `NavigationEnv` of embedded houses; without a robot file with the standard robot.
+
+    On a device other than the CPU it is a `WarpNavigationEnv`.
+    """
     from vn_nav.robot import load_robot
     from vn_sim_bridge.env import EnvConfig, NavigationEnv
     from vn_sim_bridge.randomisation import load_randomisation
     config = EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs,
                        randomisation=load_randomisation(randomisation), **options)
-    return NavigationEnv(config, load_robot(robot) if robot else None, threads=threads)
+    spec = load_robot(robot) if robot else None
+    if device == 'cpu':
+        return NavigationEnv(config, spec, threads=threads)
+    _check_gpu(device)
+    from vn_sim_bridge.warp_env import WarpNavigationEnv
+    return WarpNavigationEnv(config, spec, device=device)
+
+
+def _check_gpu(device: str) -> None:
+    """Whether the simulator can run on a GPU such as cuda:0."""
+    import torch
+    try:
+        import warp as wp
+    except ImportError as error:
+        raise UserError('the simulator runs on a GPU with the extra "gpu"', str(error),
+                        "pip install 'vn_nav[gpu]', or use --device cpu") from error
+    number = torch.device(device).index or 0
+    known = min(torch.cuda.device_count(), wp.get_cuda_device_count())
+    if number >= known:
+        raise UserError('the device is a GPU that torch and Warp find', f'{device}; they find '
+                        f'{known or "none"}', 'look at nvidia-smi and at torch.version.cuda, or '
+                        'use --device cpu')
 
 
 def run_train(args) -> int:
@@ -127,6 +158,7 @@ def run_train(args) -> int:
     config, world = train_config(args), world_options(args)
     env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
                    randomisation=args.randomisation, size=args.size, seed=args.seed,
+                   device=config.device,
                    actions=tuple(args.actions.split(',')), task=args.task,
                    objects=args.objects, goals_per_room=args.goals_per_room,
                    goal_variants=args.goal_variants,
@@ -139,7 +171,7 @@ def run_train(args) -> int:
         'command': 'vn_nav ' + shlex.join(words),
         'camera_fov_deg': math.degrees(env.robot.camera_fov),
         'camera_height': env.robot.camera_height,
-        'notes': f'Trained on {machine()}, {config.threads} thread(s), '
+        'notes': f'Trained on {machine(config.device)}, {config.threads} thread(s), '
                  f'{datetime.date.today().isoformat()}.',
         'world_version': env.world_version,
     }
@@ -166,8 +198,11 @@ def _pair_sources(args, config):
     return make
 
 
-def machine() -> str:
-    """The processor in words."""
+def machine(device: str = 'cpu') -> str:
+    """The processor in words, or the GPU."""
+    if device != 'cpu':
+        import torch
+        return torch.cuda.get_device_name(device)
     try:
         lines = Path('/proc/cpuinfo').read_text().splitlines()
         model = next(line.split(':', 1)[1].strip() for line in lines if 'model name' in line)
@@ -224,7 +259,8 @@ def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, control
     if info['task'] == 'collect':  # no goal: none to show wrong, and no shortest path to it
         wanted = [name for name in wanted if name in (evaluator.OTHER, evaluator.RANDOM)]
     rows = evaluator.measure(
-        make, checkpoint.network, houses, decoding=decoding or info['decoding'],
+        make, checkpoint.network, houses, known=info['houses'],
+        decoding=decoding or info['decoding'],
         episodes=episodes, controls=wanted, seed=seed,
         threshold=info.get('stop_threshold') if threshold is None else threshold,
         robot=load_robot(robot) if robot else None)
@@ -295,6 +331,10 @@ def run_publish(args) -> int:
     save_checkpoint(args.target, checkpoint.network, info, half=True)
     shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
     houses, rooms = info['houses'], info['rooms']
+    if 'arrival' in shipped.config.heads:
+        info['stop_threshold'] = _stop_threshold(shipped, args)
+        save_checkpoint(args.target, shipped.network, info, half=True)
+        shipped = load_checkpoint(args.target)
     info['results'] = {}
     for place, seeds in (('trained house', houses), (f'unseen house {args.unseen}',
                                                      [args.unseen])):
@@ -311,6 +351,30 @@ def run_publish(args) -> int:
                       f'{datetime.date.today().isoformat()}. Figures are defined in '
                       'docs/architecture.md.')
     save_checkpoint(args.target, shipped.network, info, half=True)
+    return 0
+
+
+def _stop_threshold(checkpoint, args) -> float:
+    """The probability of arrival that is best declared at, on starts that no figure is from."""
+    from vn_nav.evaluation import evaluator
+    success = {}
+    for threshold in STOP_THRESHOLDS:
+        rows, _ = measure(checkpoint, checkpoint.info['houses'][:16], checkpoint.info['rooms'],
+                          episodes=args.episodes, seed=20_000, controls=False,
+                          threshold=threshold, robot=args.robot)
+        (row,) = evaluator.figures(rows)[evaluator.DECLARED].values()
+        success[threshold] = row['success']
+        print(f'declaring above {threshold:.0%}: success {row["success"]:.2f}, false stops '
+              f'{row["false_stops"]:.2f}', flush=True)
+    return max(success, key=success.get)
+
+
+def run_export(args) -> int:
+    """`vn_nav export`."""
+    from vn_nav.policy.checkpoint import load_checkpoint
+    from vn_nav.policy.export import export_onnx
+    for path in export_onnx(load_checkpoint(args.checkpoint), args.onnx):
+        print(f'{path}: {path.stat().st_size / 1e6:.1f} MB')
     return 0
 
 

@@ -20,9 +20,17 @@ from rich.table import Table
 
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode, drives_from_bag
-from vn_nav.evaluation.evaluator import policy_actor, random_actor, run_episodes
+from vn_nav.evaluation.evaluator import (
+    ARRIVAL,
+    DECLARED,
+    STOP_THRESHOLD,
+    PolicyActor,
+    random_actor,
+    run_episodes,
+)
 from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.evaluation.report import write_report
+from vn_nav.evaluation.tables import TITLES
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
@@ -31,9 +39,10 @@ TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
 UNSEEN_HOUSE = 8  # seed
 SEED = 2026  # of starts and goals
 STALL = 60.0  # s without a finished episode after which the demo gives up
-LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up) after (\d+) decisions, ([\d.]+) m')
+LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up|stopped elsewhere) after (\d+) '
+                  r'decisions, ([\d.]+) m')
 RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground_truth/odom',
-            'action', 'action_names', 'collision', 'reward', 'episode_end', 'episode',
+            'action', 'action_names', 'arrived', 'collision', 'reward', 'episode_end', 'episode',
             'episode_result', 'scene', '/diagnostics']
 
 
@@ -102,6 +111,8 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
         unseen_episodes: int = 10) -> int:
     """Drive, record, measure, report.
 
+    A checkpoint with a stop threshold has to declare its stop; for others arriving is enough.
+
     Args:
         out: folder for bag, page and result.json; what an earlier demo left there is replaced.
         folder: of the checkpoint.
@@ -167,7 +178,7 @@ def _drive(console: Console, processes: Processes, checkpoint: Path, info: dict,
         'house': house, 'rooms': info['rooms'], 'randomisation': info['randomisation'],
         'robot': base, 'time': 'lock_step', 'seed': SEED,
         'episodes': count, 'max_decisions': limit, 'exit_when_done': True,
-        'start_time': start_time})
+        'stop': _stop(info), 'start_time': start_time})
     processes.start(policy, 'vn_nav.nodes.policy_node', {
         'checkpoint': str(checkpoint), 'robot': base, 'time': 'lock_step', 'auto_enable': True,
         'seed': SEED})
@@ -193,6 +204,11 @@ def _drive(console: Console, processes: Processes, checkpoint: Path, info: dict,
     processes.stop(bridge)
 
 
+def _stop(info: dict) -> str:
+    """What ends an episode before its limit, by what a checkpoint says of itself."""
+    return ARRIVAL if info['stop_threshold'] is None else DECLARED
+
+
 def _progress(done: list[tuple], count: int) -> Table:
     """The live view: one row an episode, the newest at the bottom."""
     table = Table(box=None, pad_edge=False)
@@ -210,15 +226,17 @@ def _progress(done: list[tuple], count: int) -> Table:
 def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint,
              make_env: Callable) -> dict:
     """Figures from the bag; on the same starts random actions, and the policy without ROS."""
-    result = {}
+    info, result = checkpoint.info, {}
+    stop = _stop(info)
     for (place, house, count, limit), drive in zip(places, drives, strict=True):
         figures = summarise([recorded.episode for recorded in drive.episodes])
-        env = make_env([house], checkpoint.info['rooms'], count, max_decisions=limit,
-                       randomisation=checkpoint.info['randomisation'])
+        env = make_env([house], info['rooms'], count, max_decisions=limit, stop=stop,
+                       randomisation=info['randomisation'])
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
-        actor = policy_actor(env, checkpoint.network, checkpoint.info['decoding'], SEED)
+        actor = PolicyActor(env, checkpoint.network, info['decoding'], SEED,
+                            STOP_THRESHOLD if stop == ARRIVAL else info['stop_threshold'])
         in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
-        result[place] = figures | {'house': house, 'max_decisions': limit,
+        result[place] = figures | {'house': house, 'max_decisions': limit, 'stop': stop,
                                    'random': summarise(control),
                                    'without_ros': summarise(in_process),
                                    'minus_without_ros': _paired(drive.episodes, in_process)}
@@ -234,15 +252,21 @@ def _paired(recorded: list[RecordedEpisode], in_process: list[Episode]) -> dict:
 
 
 def _show(console: Console, result: dict, out: Path) -> None:
-    table = Table(title='Measured from the bag of this run')
-    for heading in ('house', 'policy', 'episodes', 'success', 'SPL', 'decisions', 'collisions'):
+    stop = result['trained']['stop']
+    table = Table(title='Measured from the bag of this run'
+                  + (f': {TITLES[stop].lower()}' if stop == DECLARED else ''))
+    headings = ('house', 'policy', 'episodes', 'success', 'SPL', 'decisions', 'collisions',
+                *(('declared', 'false stops') if stop == DECLARED else ()))
+    for heading in headings:
         table.add_column(heading, justify='left' if heading in ('house', 'policy') else 'right')
     for place in ('trained', 'unseen'):
         for policy, r in (('vn_nav on ROS 2', result[place]),
                           ('without ROS', result[place]['without_ros']),
                           ('random', result[place]['random'])):
             table.add_row(place, policy, str(r['episodes']), f'{r["success"]:.0%}',
-                          f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["collisions"]:.1%}')
+                          f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["collisions"]:.1%}',
+                          *((f'{r["declared"]:.0%}', f'{r["false_stops"]:.0%}')
+                            if stop == DECLARED else ()))
     console.print()
     console.print(table)
     console.print(f'page    {out / "report.html"}\nbag     {out / "bag"}\n'

@@ -23,6 +23,9 @@ class Observation(NamedTuple):
     goal_index: Any  # [...] int64 into goals: each goal is kept, and encoded, once
     last_action: Any  # [...] int64, -1 at an episode's start
     last_reward: Any  # [...] float32, the sparse task reward only
+    # Beyond these, for the architecture icra2017: `scene` [...] int64, the number of the scene,
+    # and `features` [...,F] float32, the picture's frozen features.
+    extras: dict[str, Any] | None = None
 
 
 def preprocess(image: np.ndarray, size: int, *, fov: float | None = None,

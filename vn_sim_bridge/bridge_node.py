@@ -28,6 +28,7 @@ from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos
 from vn_nav.robot import RobotSpec, load_robot
 from vn_sim_bridge import tasks
+from vn_sim_bridge.env import STOPS
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.randomisation import load_randomisation
 from vn_sim_bridge.simulated_robot import TICK, TRUNCATED, SimulatedRobot
@@ -35,6 +36,7 @@ from vn_sim_bridge.world import WORLD_VERSION
 
 COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base stops
 LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base stops
+STATEMENT_PATIENCE = 2.0  # s of wall time, see _on_arrived
 OPTICAL_FRAME = 'camera_optical_frame'
 
 # name: (default, meaning); the types of the defaults are the types of the parameters.
@@ -52,6 +54,7 @@ PARAMETERS = {
     'camera_rate': (10.0, 'pictures per simulated second in real_time and in continuous [Hz]'),
     'episodes': (0, 'episodes to run; 0: without end'),
     'max_decisions': (300, 'limit of an episode'),
+    'stop': ('arrival', 'what ends an episode before its limit: arrival, or declared: `arrived`'),
     'start_time': (1.0, 'first stamp [s]; zero would mean "no time yet"'),
     'exit_when_done': (False, 'exit after the last episode instead of standing still'),
 }
@@ -76,13 +79,15 @@ class SimBridgeNode(Node):
         self.robot = SimulatedRobot(
             values['house'], values['rooms'], robot=robot, size=values['size'],
             noise=values['noise'], seed=values['seed'], max_decisions=values['max_decisions'],
-            randomisation=load_randomisation(values['randomisation']))
+            stop=values['stop'], randomisation=load_randomisation(values['randomisation']))
         self.size, self.start_time = values['size'], values['start_time']
         self.command = np.zeros(4)
         self.command_tick = 0  # when the newest command came, in ticks
         self.command_count = 0
         self.next_goal = None  # pose from the goal_pose topic, for the next reset
         self.done = False
+        self.says_arrived = self.goal_taken = False  # the policy, in this episode
+        self.goal_shown = 0.0  # steady time [s]
         self._make_interfaces()
         self.begin_episode(0)
 
@@ -98,6 +103,7 @@ class SimBridgeNode(Node):
              f'camera_rate lies between 1 and {1 / TICK:.0f} Hz'),
             ('size', 16 <= values['size'] <= 1024, 'size lies between 16 and 1024 pixels'),
             ('max_decisions', values['max_decisions'] >= 1, 'max_decisions is at least 1'),
+            ('stop', values['stop'] in STOPS, f'stop is {" or ".join(STOPS)}'),
             ('start_time', values['start_time'] > 0, 'start_time is positive'),
             ('episodes', values['episodes'] >= 0, 'episodes is 0 (without end) or more'),
         )
@@ -126,6 +132,9 @@ class SimBridgeNode(Node):
         self._clock = publisher(Clock, '/clock')
         self.create_subscription(Twist, 'cmd_vel', self._on_command, qos('cmd_vel'))
         self.create_subscription(PoseStamped, 'goal_pose', self._on_goal_pose, qos('goal_pose'))
+        if self.robot.stop_rule == 'declared':
+            # Deeper than the contract: what is said of one goal and of the next are both heard.
+            self.create_subscription(Bool, 'arrived', self._on_arrived, qos('arrived', depth=10))
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._label_names.publish(String(data=json.dumps(list(LABELS))))
         self._scene.publish(String(data=json.dumps(self._scene_facts())))
@@ -154,6 +163,7 @@ class SimBridgeNode(Node):
             'arrival': {'radius': tasks.ARRIVAL_RADIUS,
                         'heading_deg': math.degrees(tasks.ARRIVAL_HEADING)},
             'camera_fov_deg': math.degrees(self.robot.robot.camera_fov),
+            'stop': self.robot.stop_rule,
             'max_decisions': self.robot.max_decisions,
             'tick': TICK,
         }
@@ -179,6 +189,19 @@ class SimBridgeNode(Node):
             self.get_logger().error(f'stopped: {error}', throttle_duration_sec=1.0)
         self.command_tick = self.robot.tick_count
         self.command_count += 1
+
+    def _on_arrived(self, message: Bool) -> None:
+        """What the robot says. It may still mean the goal before.
+
+        A policy says false when it takes a goal; what it says after that is of this goal. True
+        without false before it counts only when it has not been taken back for a while.
+        """
+        self.says_arrived = message.data
+        self.goal_taken |= not message.data
+
+    def _declares(self) -> bool:
+        return self.says_arrived and (
+            self.goal_taken or time.monotonic() - self.goal_shown > STATEMENT_PATIENCE)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         q = message.pose.orientation
@@ -209,6 +232,8 @@ class SimBridgeNode(Node):
         """Move the robot to a new start and show the new goal."""
         episode = self.robot.begin_episode(index, goal_pose)
         self.command = np.zeros(4)
+        self.says_arrived = self.goal_taken = False
+        self.goal_shown = time.monotonic()
         frames = self.robot.goal_frames()
         message = images.fill_image(Image(), np.ascontiguousarray(
             frames.rgb[0].transpose(1, 2, 0)), 'rgb8')
@@ -224,7 +249,8 @@ class SimBridgeNode(Node):
     def tick(self) -> None:
         """Advance by one tick under the command in force, and publish what follows."""
         stale = (self.robot.tick_count - self.command_tick) * TICK >= COMMAND_TIMEOUT
-        if stale:
+        declares = self._declares()
+        if stale or declares:
             self.command = np.zeros(4)
         decision = self.robot.tick(self.command)
         shows_picture = self.robot.tick_count % self.picture_ticks == 0
@@ -232,6 +258,8 @@ class SimBridgeNode(Node):
             decision = self.robot.end_decision()
         stamp = self.stamp()
         begun = decision is not None and self._judge(decision)
+        if declares and not begun and self.robot.episode is not None:
+            begun = self._judge(self.robot.declare())
         self._clock.publish(Clock(clock=stamp))
         # After a jump to a new start the first picture waits for a tick, so that the new goal
         # arrives before it.
@@ -253,7 +281,8 @@ class SimBridgeNode(Node):
             'path_length': episode.path_length, 'distance': decision.distance,
             'heading_error_deg': math.degrees(decision.heading_error)})))
         self._episode_end.publish(UInt8(data=decision.end))
-        outcome = 'gave up' if decision.end == TRUNCATED else 'arrived'
+        outcome = ('gave up' if decision.end == TRUNCATED else
+                   'arrived' if decision.success else 'stopped elsewhere')
         self.get_logger().info(
             f'episode {episode.index} ({self.robot.goal.room}): {outcome} after '
             f'{episode.decisions} decisions, {episode.path_length:.1f} m')

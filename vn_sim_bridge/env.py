@@ -53,6 +53,8 @@ class EnvConfig:
     noise: bool = True
     progress_reward: float = 0.0  # per metre of geodesic progress
     collision_reward: float = 0.0  # per decision that touched something; a penalty is negative
+    step_reward: float = 0.0  # per decision that does not reach the goal; a penalty is negative
+    goal_bonus: float = 0.0  # at the goal, beside the sparse reward
     min_start_distance: float = 1.0  # m, geodesic
     one_goal_per_env: bool = False  # environment i keeps pair i; else drawn each episode
     seed: int = 0
@@ -347,8 +349,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             None if self.declare_action is None else declared))
         objects.scene[verdict.removed] = -1
         reward = np.where(reset, 0, verdict.reward + tasks.shaping_reward(
-            before, self._distance, collided, progress=self.config.progress_reward,
-            collision=self.config.collision_reward)).astype(np.float32)
+            before, self._distance, collided, verdict.success,
+            progress=self.config.progress_reward, collision=self.config.collision_reward,
+            step=self.config.step_reward, goal=self.config.goal_bonus)).astype(np.float32)
         if self.config.exploration_reward:
             reward[acting] += self.config.exploration_reward * self._explore(acting)
         self._last_action[driving] = actions[driving]
@@ -494,8 +497,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def _explore_action(self, reset: np.ndarray, overlap: np.ndarray) -> np.ndarray:
         """What the `Explorer` would do, [N] int64; it looks from here."""
         self._explorer.begin(np.nonzero(reset)[0])
+        turned = np.where(self._last_action < 0, 0, np.sign(self._deltas[self._last_action, 2]))
         turns = self._explorer.turns(self.backend.poses, self.house_index, overlap,
-                                     self._distance, self._goal_yaw, self._maps)
+                                     self._distance, self._goal_yaw, self._maps, turned)
         table = self._turning_table()
         return np.where(turns == 0, table['forward'], np.where(
             turns > 0, table['rotate_left'], table['rotate_right']))

@@ -20,8 +20,10 @@ COARSE = 2  # cells of the floor map a side of one of the explorer's
 SIDE = COARSE * CELL  # m
 SIGHT = 4.0  # m: what lies farther was not really looked at
 RAYS = 41  # across the camera's field of view
+NEAR = 1.0  # m: around itself a robot need not look
 ENOUGH = 0.15  # overlap with the goal picture from which the goal counts as seen
 TURN_COST = 0.05  # m, charged for one rotation
+TURN_BACK_COST = 0.6  # m, charged for rotating against the rotation before
 BLOCKED_COST = 1.0  # per metre that a contact cuts off a forward move
 FAR = np.float32(1e9)
 
@@ -65,7 +67,8 @@ class Explorer:
         self.found[env_ids] = False
 
     def turns(self, poses: np.ndarray, house_index: np.ndarray, overlap: np.ndarray,
-              distance: np.ndarray, goal_yaw: np.ndarray, goal_maps: np.ndarray) -> np.ndarray:
+              distance: np.ndarray, goal_yaw: np.ndarray, goal_maps: np.ndarray,
+              turned: np.ndarray) -> np.ndarray:
         """Look from here, then say by how much each robot should turn; 0: drive forward.
 
         Args:
@@ -73,6 +76,7 @@ class Explorer:
             overlap: [N] share of the goal picture in view.
             distance: [N] geodesic, to the goal [m]; goal_yaw: [N] rad.
             goal_maps: [N,rows,columns] geodesic distances to the goal [m].
+            turned: [N] sign of the rotation that was the last action; 0: it was none.
 
         Returns:
             [N] rad, left.
@@ -80,7 +84,7 @@ class Explorer:
         self.found |= overlap >= ENOUGH
         wanted = np.empty(len(poses))
         _advise(poses, house_index, distance, goal_yaw, self.found, self.seen, self._open,
-                self._wall, self._free, self._origins, goal_maps, self._rays, self._turns,
+                self._wall, self._free, self._origins, goal_maps, turned, self._rays, self._turns,
                 self._turn, self._length, self._radius, wanted)
         return wanted
 
@@ -101,6 +105,12 @@ def _walls(house: House, shape: tuple[int, int]) -> np.ndarray:
 def _look(x, y, yaw, rays, wall, seen):
     """Mark the cells along the rays as seen, up to the first wall, which is seen too."""
     rows, columns = wall.shape
+    around = int(NEAR / SIDE)
+    for a in range(-around, around + 1):
+        for b in range(-around, around + 1):
+            i, j = int(y / SIDE) + a, int(x / SIDE) + b
+            if a * a + b * b <= around * around and 0 <= i < rows and 0 <= j < columns:
+                seen[i, j] = True
     for ray in rays:
         c, s = math.cos(yaw + ray), math.sin(yaw + ray)
         reach = 0.0
@@ -183,7 +193,7 @@ def _around(x, y, field, side):
 
 @numba.njit(cache=True)
 def _advise(poses, house_index, distance, goal_yaw, found, seen, open_cells, walls, free_cells,
-            origins, goal_maps, rays, turns, turn, length, radius, wanted):
+            origins, goal_maps, turned, rays, turns, turn, length, radius, wanted):
     rows, columns = open_cells.shape[1:]
     field = np.empty((rows, columns), np.float32)
     queue = np.empty(8 * rows * columns, np.int64)
@@ -213,6 +223,8 @@ def _advise(poses, house_index, distance, goal_yaw, found, seen, open_cells, wal
             there = (_around(ex, ey, field, SIDE) if exploring
                      else _around(ex, ey, goal_maps[n], CELL))
             cost = there + TURN_COST * abs(k) + BLOCKED_COST * (length - reach)
+            if k * turned[n] < 0:
+                cost += TURN_BACK_COST  # what it does next can be told from what it did
             if cost < best:
                 best, choice = cost, k
         wanted[n] = choice * turn

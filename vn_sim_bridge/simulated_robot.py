@@ -62,12 +62,14 @@ class SimulatedRobot:
         seed: of starts, goals and noise. Episode e starts as environment e of a `NavigationEnv`
             with the same seed does.
         max_decisions: limit of an episode.
+        stop: 'arrival' ends an episode, or 'declared': only `declare` does, as in `EnvConfig`.
         randomisation: of light, camera and base; default: nothing varies.
     """
 
     def __init__(self, house: int, rooms: int, *, robot: RobotSpec, size: int = 84,
                  noise: bool = True, seed: int = 0, max_decisions: int = 300,
-                 randomisation: Randomisation | None = None):
+                 stop: str = 'arrival', randomisation: Randomisation | None = None):
+        self.stop_rule = stop
         self.house = generate_house(house, rooms=rooms)
         self.robot, self.noise, self.seed, self.max_decisions = robot, noise, seed, max_decisions
         self.randomisation = randomisation or Randomisation()
@@ -226,15 +228,23 @@ class SimulatedRobot:
 
     def end_decision(self) -> Decision:
         """Judge arrival, collision and the episode's limit."""
+        return self._judge(declared=False)
+
+    def declare(self) -> Decision:
+        """The robot says that it has arrived: a decision that ends the episode, true or not."""
+        return self._judge(declared=True)
+
+    def _judge(self, *, declared: bool) -> Decision:
         collided, self._touched, self._in_decision = self._touched, False, False
         distance = self.distance()
         error = float(tasks.heading_error(self.pose[2], self.goal.pose[2]))
-        success = bool(tasks.arrived(distance, error))
+        success = (declared or self.stop_rule == 'arrival') and bool(
+            tasks.arrived(distance, error))
         end = 0
         if self.episode is not None:
             self.episode.decisions += 1
             self.episode.collisions += collided
-            if success:
+            if success or declared:
                 end = TERMINATED
             elif self.episode.decisions >= self.max_decisions:
                 end = TRUNCATED

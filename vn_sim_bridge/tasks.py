@@ -61,15 +61,18 @@ def sparse_reward(success):
     return np.asarray(success, np.float32)
 
 
-def shaping_reward(before, after, collided, *, progress: float, collision: float):
+def shaping_reward(before, after, collided, success=False, *, progress: float, collision: float,
+                   step: float = 0.0, goal: float = 0.0):
     """Optional terms beside the sparse reward; they never reach the network.
 
     Args:
         before, after: geodesic distance to the goal around the decision [m].
-        collided: [N] bool.
+        collided: [N] bool; success: [N] bool.
         progress: reward per metre of progress; collision: reward of a contact (negative).
+        step: of a decision that does not reach the goal; goal: of one that does.
     """
-    return (progress * (before - after) + collision * collided).astype(np.float32)
+    return (progress * (before - after) + collision * collided
+            + np.where(success, goal, step)).astype(np.float32)
 
 
 def shows_room(labels: np.ndarray, kind: str) -> np.ndarray:

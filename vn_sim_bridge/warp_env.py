@@ -20,9 +20,10 @@ from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.env import EnvConfig
 from vn_sim_bridge.houses.house import CELL
 from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.overlap import GRID, SLACK, TOLERANCE, lift
 from vn_sim_bridge.randomisation import draw_appearance
 from vn_sim_bridge.render.pack import FACING
-from vn_sim_bridge.render.warp_renderer import WarpRenderer
+from vn_sim_bridge.render.warp_renderer import WarpRenderer, camera_frame
 from vn_sim_bridge.world import (
     MAX_TILT,
     PRECISION,
@@ -35,6 +36,8 @@ from vn_sim_bridge.world import (
 wp.set_module_options({'enable_backward': False, 'fast_math': False})
 
 MODES = {tasks.RIGHT: 0, tasks.WRONG: 1, tasks.BLANK: 2}
+# Teachers plan on the CPU: `NavigationEnv` alone knows them.
+TEACHERS = ('explorer_action', 'oracle_action')
 _f = wp.float64
 _pi = wp.constant(wp.float64(math.pi))
 _to_unit = wp.constant(wp.float64(2.0**-53))
@@ -63,6 +66,8 @@ _cell = wp.constant(wp.float64(CELL))
 _arrival_radius = wp.constant(wp.float64(tasks.ARRIVAL_RADIUS))
 _arrival_heading = wp.constant(wp.float64(tasks.ARRIVAL_HEADING))
 _infinity = wp.constant(wp.float64(math.inf))
+_tolerance = wp.constant(wp.float64(TOLERANCE))
+_slack = wp.constant(wp.float64(SLACK))
 
 
 @wp.struct
@@ -90,8 +95,12 @@ class Robots:
     step: wp.array(dtype=wp.int64)
     goal: wp.array(dtype=wp.int64)
     shown: wp.array(dtype=wp.int64)
+    picture: wp.array(dtype=wp.int64)  # of the true goal; grey where that is shown
     distance: wp.array(dtype=wp.float64)
     start_distance: wp.array(dtype=wp.float64)
+    heading_error: wp.array(dtype=wp.float64)
+    arrived: wp.array(dtype=wp.bool)
+    goal_pose: wp.array2d(dtype=wp.float32)  # as `overlap.relative_pose`
     path_length: wp.array(dtype=wp.float64)
     last_action: wp.array(dtype=wp.int64)
     last_reward: wp.array(dtype=wp.float32)
@@ -111,6 +120,10 @@ class Robots:
     sensor_key: wp.array(dtype=wp.uint64)
 
 
+# Of `Robots`: follows from the rest with the next step.
+NOT_STATE = ('camera', 'focal', 'sensor_key')
+
+
 @wp.struct
 class Rules:
     """Numbers of the configuration."""
@@ -126,6 +139,8 @@ class Rules:
     motion_noise: wp.int32
     progress: wp.float64
     collision: wp.float64
+    step_reward: wp.float64
+    goal_bonus: wp.float64
     radius: wp.float64
     camera_height: wp.float64
     camera_pitch: wp.float64
@@ -320,8 +335,10 @@ def begin(houses: Houses, robots: Robots, rules: Rules, n: int):
     goal = first + local
     robots.goal[n] = wp.int64(goal)
     robots.shown[n] = wp.int64((first + shown) * rules.variants + variant)
+    robots.picture[n] = wp.int64(goal * rules.variants + variant)
     if rules.mode == 2:
         robots.shown[n] = rules.blank_goal
+        robots.picture[n] = rules.blank_goal
     low, high = houses.first_cell[goal], houses.first_cell[goal + 1]
     limit = rules.tau * houses.cell_distance[high - 1]
     left, right = low + 0, high + 0  # the first cell beyond the limit
@@ -348,6 +365,24 @@ def begin(houses: Houses, robots: Robots, rules: Rules, n: int):
 
 
 @wp.func
+def compare(houses: Houses, robots: Robots, n: int):
+    """Where the goal is from here: `tasks.arrived` and `overlap.relative_pose`."""
+    goal = wp.int32(robots.goal[n])
+    yaw = robots.pose[n, 2]
+    turn = houses.goal_pose[goal, 2] - yaw
+    robots.heading_error[n] = wp.abs(wrap(yaw - houses.goal_pose[goal, 2]))
+    robots.arrived[n] = (robots.distance[n] <= _arrival_radius
+                         and robots.heading_error[n] <= _arrival_heading)
+    x = houses.goal_pose[goal, 0] - robots.pose[n, 0]
+    y = houses.goal_pose[goal, 1] - robots.pose[n, 1]
+    c, s = wp.cos(yaw), wp.sin(yaw)
+    robots.goal_pose[n, 0] = wp.float32(c * x + s * y)
+    robots.goal_pose[n, 1] = wp.float32(c * y - s * x)
+    robots.goal_pose[n, 2] = wp.float32(wp.cos(turn))
+    robots.goal_pose[n, 3] = wp.float32(wp.sin(turn))
+
+
+@wp.func
 def aim(robots: Robots, rules: Rules, n: int):
     """Where the camera is and looks."""
     robots.camera[n, 0] = robots.pose[n, 0]
@@ -371,6 +406,7 @@ def restart(houses: Houses, robots: Robots, rules: Rules):
     robots.terminated[n] = False
     robots.truncated[n] = False
     robots.reward[n] = wp.float32(0.0)
+    compare(houses, robots, n)
     aim(robots, rules, n)
 
 
@@ -386,6 +422,7 @@ def decide(houses: Houses, robots: Robots, rules: Rules, deltas: wp.array2d(dtyp
         robots.terminated[n] = False
         robots.truncated[n] = False
         robots.reward[n] = wp.float32(0.0)
+        compare(houses, robots, n)
         aim(robots, rules, n)
         return
     env, episode, step = wp.int64(n), robots.episode[n], robots.step[n]
@@ -425,14 +462,17 @@ def decide(houses: Houses, robots: Robots, rules: Rules, deltas: wp.array2d(dtyp
     before = robots.distance[n] + none
     after = distance_at(houses, house, goal, robots.pose[n, 0], robots.pose[n, 1])
     robots.distance[n] = after
-    error = wp.abs(wrap(robots.pose[n, 2] - houses.goal_pose[goal, 2]))
-    success = after <= _arrival_radius and error <= _arrival_heading
+    compare(houses, robots, n)
+    success = robots.arrived[n]
     sparse = wp.float32(0.0)
-    if success:
-        sparse = wp.float32(1.0)
     shaping = rules.progress * (before - after)
     if robots.collided[n]:
         shaping = shaping + rules.collision
+    if success:
+        sparse = wp.float32(1.0)
+        shaping = shaping + rules.goal_bonus
+    else:
+        shaping = shaping + rules.step_reward
     robots.reward[n] = sparse + wp.float32(shaping)
     robots.last_action[n] = actions[n]
     robots.last_reward[n] = sparse
@@ -442,14 +482,47 @@ def decide(houses: Houses, robots: Robots, rules: Rules, deltas: wp.array2d(dtyp
     aim(robots, rules, n)
 
 
+@wp.kernel
+def share_in_view(points: wp.array3d(dtype=wp.float32), picture: wp.array(dtype=wp.int64),
+                  depth: wp.array3d(dtype=wp.float32), camera: wp.array2d(dtype=wp.float64),
+                  focal: wp.array(dtype=wp.float64), share: wp.array(dtype=wp.float32)):
+    """As `overlap.overlap`, of the points of each robot's goal picture."""
+    n = wp.tid()
+    goal, size = wp.int32(picture[n]), depth.shape[1]
+    frame = camera_frame(camera, n)
+    half = wp.float64(size) * _f(0.5)
+    known, seen = int(0), int(0)
+    for p in range(points.shape[1]):
+        if not wp.isnan(points[goal, p, 0]):
+            known += 1
+            x = _f(points[goal, p, 0]) - frame[0]
+            y = _f(points[goal, p, 1]) - frame[1]
+            z = _f(points[goal, p, 2]) - frame[2]
+            ahead = x * frame[3] + y * frame[4] + z * frame[5]
+            if ahead > _f(0.0):
+                scale = focal[n] / ahead
+                column = wp.floor((x * frame[6] + y * frame[7]) * scale + half)
+                row = wp.floor((x * frame[9] + y * frame[10] + z * frame[11]) * scale + half)
+                inside = _f(size)
+                if (_f(0.0) <= column and column < inside and _f(0.0) <= row and row < inside):
+                    gap = wp.abs(ahead - _f(depth[n, wp.int32(row), wp.int32(column)]))
+                    if gap <= _tolerance * ahead + _slack:
+                        seen += 1
+    share[n] = wp.float32(0.0)
+    if known > 0:
+        share[n] = wp.float32(_f(seen) / _f(known))
+
+
 class WarpNavigationEnv:
     """Image-goal navigation on one device; see `NavigationEnv` for what it simulates.
 
     `reset` and `step` return the same dicts as `NavigationEnv` does, of tensors that live on the
-    device and change in place with the next step.
+    device and change in place with the next step. They work on the stream that is PyTorch's at
+    construction, so that neither waits for the other. `goals` and `goal_segmentation` are tensors
+    there too.
 
     Args:
-        config: task 'image', without late pictures.
+        config: task 'image', without late pictures, and no teacher among the privileged.
         robot: the standard robot if left out.
         device: Warp device, such as 'cuda:0' or 'cpu'.
     """
@@ -463,14 +536,17 @@ class WarpNavigationEnv:
         if config.stop != 'arrival' or config.exploration_reward:
             raise UserError('on the device episodes end on arrival, and new floor pays nothing',
                             (config.stop, config.exploration_reward), 'use NavigationEnv')
-        if unknown := sorted(set(config.privileged) & {'goal_pose', 'overlap'}):
-            raise UserError('the device knows no goal_pose and no overlap', ', '.join(unknown),
-                            'use NavigationEnv')
+        if teachers := sorted(set(config.privileged) & set(TEACHERS)):
+            raise UserError('teachers plan on the CPU: the device tells no actions to imitate',
+                            ', '.join(teachers), 'set imitation=0 (--set imitation=0), or train '
+                            'on the CPU')
         if config.randomisation.late_picture:
             raise UserError('pictures are never late on the device',
                             config.randomisation.late_picture, 'use NavigationEnv')
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs, self.device = config.num_envs, device
+        if wp.get_device(device).is_cuda:
+            wp.set_stream(wp.stream_from_torch(wp.device_to_torch(device)), device)
         self.world_version, self.action_names = WORLD_VERSION, self.robot.action_names
         self.houses = [generate_house(seed, rooms=config.rooms,
                                       goals_per_room=config.goals_per_room,
@@ -492,7 +568,13 @@ class WarpNavigationEnv:
         self._absent = (self._put(np.zeros((self.num_envs, 0)), np.int64),
                         self._put(np.zeros((self.num_envs, 0, 4)), np.float64),
                         self._put(np.zeros((self.num_envs, 0)), np.int64))
+        self._overlap = wp.zeros(self.num_envs, dtype=wp.float32, device=device)
         self._draw_goals(task, scenes)
+        self._state = {name: wp.to_torch(getattr(self._robots, name)) for name in Robots.vars
+                       if name not in NOT_STATE}
+        self._drawn = {name: wp.to_torch(getattr(self.renderer, name))
+                       for name in ('rgb', 'depth', 'labels')}
+        self._in_view = wp.to_torch(self._overlap)
 
     def _put(self, values, dtype) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype), device=self.device)
@@ -529,6 +611,7 @@ class WarpNavigationEnv:
         rules.max_decisions = config.max_decisions
         rules.motion_noise = int(config.noise)
         rules.progress, rules.collision = config.progress_reward, config.collision_reward
+        rules.step_reward, rules.goal_bonus = config.step_reward, config.goal_bonus
         rules.radius, rules.camera_height = robot.footprint_radius, robot.camera_height
         rules.camera_pitch, rules.camera_fov = robot.camera_pitch, robot.camera_fov
         rules.size, rules.slip = config.size, varied.slip
@@ -542,7 +625,7 @@ class WarpNavigationEnv:
     def _make_robots(self) -> Robots:
         n, rooms = self.num_envs, self.renderer.rooms
         shapes = {'pose': (n, 4), 'camera': (n, 5), 'camera_offset': (n, 3), 'cube': (n, 6, 3),
-                  'lamps': (n, rooms, 3)}
+                  'lamps': (n, rooms, 3), 'goal_pose': (n, 4)}
         robots = Robots()
         for name, variable in Robots.vars.items():
             setattr(robots, name, wp.zeros(shapes.get(name, (n,)), dtype=variable.type.dtype,
@@ -581,7 +664,13 @@ class WarpNavigationEnv:
         grey = torch.full((1, 3, size, size), 128, dtype=torch.uint8,
                           device=wp.device_to_torch(self.device))
         self.goals = torch.cat([wp.to_torch(painter.rgb), grey])
+        self.goal_segmentation = torch.cat([wp.to_torch(painter.labels),
+                                            torch.zeros_like(grey[:, 0])])
         self.blank_goal = len(goal)
+        if 'overlap' in self.config.privileged:
+            points = lift(painter.depth.numpy(), cameras, self.robot.camera_fov + look.fov)
+            nowhere = np.full((1, GRID * GRID, 3), np.nan)
+            self._goal_points = self._put(np.concatenate([points, nowhere]), np.float32)
 
     def set_difficulty(self, tau: float) -> None:
         """As `NavigationEnv.set_difficulty`."""
@@ -620,12 +709,27 @@ class WarpNavigationEnv:
                                           wp.from_torch(actions.contiguous())],
                   device=self.device)
         observation, info = self._observe()
-        robots = self._robots
-        return (observation, wp.to_torch(robots.reward), wp.to_torch(robots.terminated),
-                wp.to_torch(robots.truncated), info)
+        state = self._state
+        return observation, state['reward'], state['terminated'], state['truncated'], info
+
+    @property
+    def house_index(self) -> torch.Tensor:
+        """[N] the house of each robot."""
+        return self._state['house']
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """As `NavigationEnv.get_state`; this waits for the device."""
+        return {'seed': np.array(self._rules.seed),
+                **{name: rows.cpu().numpy().copy() for name, rows in self._state.items()}}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Stand where `get_state` was taken."""
+        self._rules.seed = int(state['seed'])
+        for name, rows in self._state.items():
+            rows.copy_(torch.from_numpy(state[name]))
 
     def _observe(self):
-        robots, varied = self._robots, self.config.randomisation
+        robots, varied, state = self._robots, self.config.randomisation, self._state
         sensor = {}
         if varied.noise[1] > 0 or varied.blur[1] > 0:
             sensor = {'noise': robots.noise, 'blur': robots.blur, 'keys': robots.sensor_key}
@@ -633,22 +737,32 @@ class WarpNavigationEnv:
         self.renderer.render(robots.house, robots.camera, robots.focal, robots.cube, robots.lamps,
                              object_scene=scene, object_pose=pose, object_room=room, **sensor)
         observation = {
-            'image': wp.to_torch(self.renderer.rgb),
-            'goal_index': wp.to_torch(robots.shown),
-            'last_action': wp.to_torch(robots.last_action),
-            'last_reward': wp.to_torch(robots.last_reward),
+            'image': self._drawn['rgb'],
+            'goal_index': state['shown'],
+            'last_action': state['last_action'],
+            'last_reward': state['last_reward'],
         }
         info = {
-            'reset': wp.to_torch(robots.reset),
-            'success': wp.to_torch(robots.terminated),
-            'collided': wp.to_torch(robots.collided),
-            'distance': wp.to_torch(robots.distance),
-            'start_distance': wp.to_torch(robots.start_distance),
-            'path_length': wp.to_torch(robots.path_length),
-            'decisions': wp.to_torch(robots.step),
-            'goal': wp.to_torch(robots.goal),
-            'pose': wp.to_torch(robots.pose),
-            'depth': wp.to_torch(self.renderer.depth),
-            'segmentation': wp.to_torch(self.renderer.labels),
+            'reset': state['reset'],
+            'success': state['terminated'],
+            'arrived': state['arrived'],
+            'collided': state['collided'],
+            **{name: state[name].float()
+               for name in ('distance', 'heading_error', 'start_distance', 'path_length')},
+            'decisions': state['step'],
+            'goal': state['goal'],
+            'pose': state['pose'],
+            'depth': self._drawn['depth'],
+            'segmentation': self._drawn['labels'],
         }
+        wanted = self.config.privileged
+        if 'goal_segmentation' in wanted:
+            info['goal_segmentation'] = self.goal_segmentation[state['shown']]
+        if 'goal_pose' in wanted:
+            info['goal_pose'] = state['goal_pose']
+        if 'overlap' in wanted:
+            wp.launch(share_in_view, self.num_envs, [
+                self._goal_points, robots.picture, self.renderer.depth, robots.camera,
+                robots.focal, self._overlap], device=self.device)
+            info['overlap'] = self._in_view
         return observation, info

@@ -1,7 +1,8 @@
 """Episodes out of a bag that the sim bridge's topics were recorded into.
 
-Nothing is taken from the bridge's own summaries: decisions, collisions, success and the metres
-driven are counted from `reward`, `collision`, `episode_end` and `ground_truth/odom`.
+Nothing is taken from the bridge's own summaries: decisions, collisions, success, declared stops
+and the metres driven are counted from `reward`, `collision`, `episode_end` and
+`ground_truth/odom`.
 """
 
 from __future__ import annotations
@@ -72,19 +73,23 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
 
     count = len(begins)
     rewards, touched, ends = ([[] for _ in range(count)] for _ in range(3))
+    judged_at = [[] for _ in range(count)]
     for topic, lists in (('reward', rewards), ('collision', touched), ('episode_end', ends)):
         for record in records[topic]:
             lists[owner(record.stamp)].append(record.message.data)
+            if topic == 'reward':
+                judged_at[owner(record.stamp)].append(record.stamp)
     # Poses and pictures carry the simulated time, which tells exactly where they belong.
     begun_at = [facts['stamp'] for _, facts in begins]
 
     def owner_by_stamp(seconds: float) -> int:
         return max(0, bisect.bisect_right(begun_at, seconds + 1e-6) - 1)
 
-    poses = [[] for _ in range(count)]
+    poses, posed_at = ([[] for _ in range(count)] for _ in range(2))
     for record in records['ground_truth/odom']:
         values = odometry_to_array(record.message)
         poses[owner_by_stamp(values[6])].append(values[:3])
+        posed_at[owner_by_stamp(values[6])].append(record.stamp)
     goal_pictures: list[np.ndarray | None] = [None] * count
     views = [[] for _ in range(count)]
     for record in records['goal_image']:
@@ -98,6 +103,13 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
             continue  # cut off: no figure counts it
         trajectory = np.array(poses[k]).reshape(-1, 3)
         episode = _measure(facts, trajectory, rewards[k], touched[k], ends[k])
+        if drives[place].scene.get('stop') == 'declared':
+            # A decision is judged just before its last pose is published, which is the pose of
+            # the tick before: the robot has come to rest.
+            last = [max(0, bisect.bisect_left(posed_at[k], at) - 1) for at in judged_at[k]]
+            episode = dataclasses.replace(
+                episode, declared=ends[k][-1] == 1,
+                reached=_reached(trajectory[last], facts['goal_pose'], drives[place].scene))
         drives[place].episodes.append(RecordedEpisode(
             facts, episode, trajectory, goal_pictures[k], views[k]))
     return drives
@@ -105,6 +117,13 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
 
 def _seconds(message) -> float:
     return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+
+
+def _reached(poses: np.ndarray, goal: list, scene: dict) -> bool:
+    """Was one of the poses [K,3] at the goal? In a straight line, as `stop_distance`."""
+    there = np.hypot(*(poses[:, :2] - goal[:2]).T) <= scene['arrival']['radius']
+    turn = np.abs((poses[:, 2] - goal[2] + math.pi) % (2 * math.pi) - math.pi)
+    return bool((there & (turn <= math.radians(scene['arrival']['heading_deg']))).any())
 
 
 def _measure(facts: dict, trajectory: np.ndarray, rewards: list, touched: list,

@@ -9,6 +9,7 @@ import numpy as np
 from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.policy.network import Policy
 from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
 
 Actor = Callable[[dict, np.ndarray], np.ndarray]  # (observation, reset [N]) -> actions [N]
@@ -99,15 +100,21 @@ class PolicyActor:
         decoding: 'sample' or 'greedy'.
         seed: of the sampled actions.
         threshold: probability of having arrived above which it declares.
+        known: houses that it was trained in, for a network with layers for several scenes.
     """
 
     def __init__(self, env, network: Policy, decoding: str, seed: int,
-                 threshold: float = STOP_THRESHOLD):
+                 threshold: float = STOP_THRESHOLD, known: Sequence[int] = ()):
         self.env, self.threshold = env, threshold
+        self.known = known if network.config.scenes > 1 else ()
         self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
-        actions = self.policy.act(observation, self.env.goals, reset)
+        scene = None
+        if self.known:
+            scene = scene_numbers([self.env.houses[house].seed for house in self.env.house_index],
+                                  self.known)
+        actions = self.policy.act(observation, self.env.goals, reset, scene)
         if self.env.declare_action is None:
             return actions
         return np.where(self.policy.arrival > self.threshold, self.env.declare_action, actions)
@@ -125,7 +132,7 @@ def policy_actor(env, network: Policy, decoding: str, seed: int) -> Actor:
 
 def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decoding: str,
             episodes: int = 100, controls: Sequence[str] = CONTROLS,
-            threshold: float | None = None, seed: int = 10_000,
+            threshold: float | None = None, seed: int = 10_000, known: Sequence[int] = (),
             robot: RobotSpec | None = None) -> Rows:
     """Episodes of a policy and of its controls, the same number in each house.
 
@@ -141,6 +148,7 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
         controls: which of `CONTROLS`, on the same starts.
         threshold: of the arrival head; None: 0.5.
         seed: of environments and sampled actions.
+        known: houses that the policy was trained in, see `PolicyActor`.
         robot: for durations; the standard robot if left out.
 
     Returns:
@@ -156,7 +164,7 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
         environments = len(part) * -(-each // rounds)
         for stop in (ARRIVAL, DECLARED):
             env = make_env(part, environments, stop)
-            actors = _actors(env, network, decoding, controls, threshold, seed + chunk)
+            actors = _actors(env, network, decoding, controls, threshold, seed + chunk, known)
             for name, (actor, shown) in actors.items():
                 env.set_shown_goal(shown)
                 rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
@@ -167,10 +175,10 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
 
 
 def _actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
-            seed: int) -> dict[str, tuple[Actor, str]]:
+            seed: int, known: Sequence[int]) -> dict[str, tuple[Actor, str]]:
     """Who drives in each row, and which goal picture it is shown; the policy itself first."""
     def policy(rule: str = decoding) -> Actor:
-        return PolicyActor(env, network, rule, seed, threshold)
+        return PolicyActor(env, network, rule, seed, threshold, known)
 
     rows = {f'right goal, {decoding}': (policy(), 'right')}
     if OTHER in controls:

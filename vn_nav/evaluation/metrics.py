@@ -20,10 +20,6 @@ def _hidden():
     return dataclasses.field(default=None, compare=False, repr=False)
 
 
-def _hidden():
-    return dataclasses.field(default=None, compare=False, repr=False)
-
-
 @dataclasses.dataclass(frozen=True)
 class Episode:
     """The outcome of one journey to one picture."""
@@ -38,13 +34,6 @@ class Episode:
     stop_heading: float  # rad, unsigned, at the end
     reward: float = 0.0  # undiscounted return
     goal: str = ''
-    scene: int = 0  # seed of the house
-    declared: bool | None = None  # whether the policy said "arrived"; None: nobody asked it to
-    reached: bool = False  # was at the goal at the end of some decision, declared or not
-    # What a map shows; no figure depends on it.
-    trajectory: np.ndarray | None = _hidden()  # [K,3] x, y [m], yaw [rad]: start and decisions
-    contacts: np.ndarray | None = _hidden()  # [C,2] where the robot touched something [m]
-    goal_pose: tuple[float, float, float] | None = _hidden()  # x, y, yaw; None: no such place
     scene: int = 0  # seed of the house
     declared: bool | None = None  # whether the policy said "arrived"; None: nobody asked it to
     reached: bool = False  # was at the goal at the end of some decision, declared or not
@@ -106,13 +95,6 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'return': float(np.mean([e.reward for e in episodes])),
         'start_distance': float(np.mean([e.start_distance for e in episodes])),
     }
-    if asked == {True}:
-        figures |= {
-            'declared': float(np.mean([e.declared for e in episodes])),
-            'false_stops': float(np.mean([e.declared and not e.success for e in episodes])),
-            'reached': float(np.mean([e.reached for e in episodes])),
-        }
-    return figures
     if asked == {True}:
         figures |= {
             'declared': float(np.mean([e.declared for e in episodes])),

@@ -11,7 +11,7 @@ import numpy as np
 from vn_nav import __version__
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
 from vn_nav.evaluation.maps import Journey, floor_map
-from vn_nav.evaluation.metrics import path_efficiency
+from vn_nav.evaluation.metrics import Episode, path_efficiency
 from vn_nav.evaluation.page import cards, page, picture, table
 
 STRIP = 9  # pictures of a film strip
@@ -34,7 +34,7 @@ def write_report(path: Path, drives: list[Drive], result: dict) -> None:
 policy were two processes that met on ROS topics alone. The policy saw the camera, the goal picture
 and its own last action; no map, no pose, no depth.</p>
 {body}
-<h2>What the words mean</h2><dl>
+<h2>What the words mean</h2><dl>{_declared_stop(result['trained'])}
 <dt>Success</dt><dd>At the end of a decision the robot stands within 0.6 m of the place (driving
 distance) and faces within 30 degrees of the picture's direction. In brackets the 95 %
 interval.</dd>
@@ -48,9 +48,19 @@ line a success rate says little.</dd></dl>
 {result['date']}, {result['seconds']:.0f} s.</p>"""))
 
 
+def _declared_stop(figures: dict) -> str:
+    if 'false_stops' not in figures:
+        return ''
+    return """
+<dt>Declared stop</dt><dd>Being there is not enough: the policy itself has to say that it has
+arrived, which ends the episode. Said elsewhere it is a false stop.</dd>"""
+
+
 def _place(place: str, drive: Drive, figures: dict) -> str:
     control = figures['random']
     low, high = figures['success_interval']
+    stops = [(f'{figures["false_stops"]:.0%}', 'false stops',
+              f'declared {figures["declared"]:.0%}')] if 'false_stops' in figures else []
     boxes = cards([
         (f'{figures["success"]:.0%}', f'success ({low:.0%} to {high:.0%})',
          f'random {control["success"]:.0%}'),
@@ -59,18 +69,20 @@ def _place(place: str, drive: Drive, figures: dict) -> str:
          f'random {control["collisions"]:.1%}'),
         (f'{figures["decisions"]:.0f}', 'decisions an episode',
          f'at most {figures["max_decisions"]}; random {control["decisions"]:.0f}'),
+        *stops,
     ])
     scene = drive.scene
     rows = table(['goal', 'outcome', 'episode', 'start [m]', 'driven [m]', 'SPL', 'decisions',
                   'collisions', 'stop [m]', 'stop [deg]'],
                  [_row(recorded) for recorded in drive.episodes], text=2)
     journeys = ''.join(_journey(recorded) for recorded in _chosen(drive.episodes))
+    stop = ' Declared stop.' if stops else ''
     limit = '' if place == 'trained' else (
         f' Episodes end at {figures["max_decisions"]} decisions here.')
     return f"""<h2>{TITLES[place]}</h2>
 <p class="soft">House {scene['house']}: {len(scene['rooms_list'])} rooms, {scene['area']:.0f}
 m&sup2;, {figures['episodes']} episodes, mean start distance
-{figures['start_distance']:.1f} m.{limit}</p>
+{figures['start_distance']:.1f} m.{stop}{limit}</p>
 {boxes}
 <figure>{_map(drive)}<figcaption>Dots are starts, arrows are goals with their viewing direction;
 <span class="yes">green</span> journeys arrived, <span class="no">orange</span> ones did
@@ -79,9 +91,16 @@ not.</figcaption></figure>
 <details><summary>All {len(drive.episodes)} episodes</summary>{rows}</details>"""
 
 
+def _outcome(episode: Episode) -> tuple[str, str]:
+    """The class of its colour, and words."""
+    if episode.success:
+        return 'yes', 'arrived'
+    return 'no', 'false stop' if episode.declared else 'gave up'
+
+
 def _row(recorded: RecordedEpisode) -> list[str]:
     e = recorded.episode
-    kind, words = ('yes', 'arrived') if e.success else ('no', 'gave up')
+    kind, words = _outcome(e)
     return [html.escape(e.goal), f'<span class="{kind}">{words}</span>',
             str(recorded.facts['episode'] + 1), f'{e.start_distance:.1f}', f'{e.path_length:.1f}',
             f'{path_efficiency(e):.2f}', str(e.decisions), str(e.collisions),
@@ -106,7 +125,7 @@ def _journey(recorded: RecordedEpisode) -> str:
     picked = np.unique(np.linspace(0, len(views) - 1, STRIP).round().astype(int))
     frames = ''.join(f'<figure><img alt="" src="{picture(views[i])}">'
                      f'<figcaption>{i}</figcaption></figure>' for i in picked)
-    kind, words = ('yes', 'arrived') if e.success else ('no', 'gave up')
+    kind, words = _outcome(e)
     return f"""<div class="journey"><h3>To the {html.escape(e.goal)}:
 <span class="{kind}">{words}</span> <small>after {e.decisions} decisions, {e.path_length:.1f} m
 for a shortest way of {e.start_distance:.1f} m</small></h3><div class="strip">

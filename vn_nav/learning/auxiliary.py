@@ -43,14 +43,13 @@ def image_target(network: Policy, name: str, rollout: Rollout) -> Tensor:
         picture = scaled.clamp(0, 1).unsqueeze(1)
     else:
         labels = _privileged(rollout, name).flatten(0, 1)
-        return label_target(labels, _colours().to(labels.device), network.target_side,
-                            network.cell)
+        return label_target(labels, _colours(labels.device), network.target_side, network.cell)
     return average_pool_target(picture, network.target_side, network.cell)
 
 
 @functools.cache
-def _colours() -> Tensor:
-    return label_colours(CLASS_COUNT)
+def _colours(device: torch.device) -> Tensor:
+    return label_colours(CLASS_COUNT).to(device)
 
 
 def image_loss(network: Policy, name: str, latents: Latents, rollout: Rollout) -> Tensor:
@@ -82,8 +81,9 @@ def pixel_control_loss(network: Policy, latents: Latents, rollout: Rollout, *, g
     q = q.view(steps + 1, batch, *q.shape[1:])
     change = pixel_change(rollout.observation.image, cell=network.cell,
                           cells=network.target_side, grey=grey)
-    target = n_step_q(change, q[-1].detach().amax(dim=1), rollout.terminated, rollout.valid,
-                      gamma=gamma)
+    # The first padded row shows a window's last picture; the memory of later ones saw it twice.
+    last = q.detach()[rollout.valid.sum(0), torch.arange(batch, device=q.device)]
+    target = n_step_q(change, last.amax(dim=1), rollout.terminated, rollout.valid, gamma=gamma)
     index = rollout.action.view(steps, batch, 1, 1, 1).expand(-1, -1, 1, *q.shape[-2:])
     taken = q[:-1].gather(2, index).squeeze(2)
     return masked_mean(((target - taken) ** 2).mean(dim=(2, 3)), rollout.valid)
@@ -128,7 +128,8 @@ def arrival_loss(network: Policy, latents: Latents, rollout: Rollout) -> Tensor:
     """Cross-entropy of having arrived; the last observations of episodes count too.
 
     Under NEXT_STEP autoreset the observation that shows an arrival is a reset row, which is no
-    frame: every row that shows a real picture is learned from, all T+1 of them but padding.
+    frame: all T rows are learned from, because each shows a real picture. For rollouts, not for
+    padded windows.
     """
     arrived = _privileged(rollout, 'arrived')[:-1].float()
     logit = network.heads['arrival'](latents.hidden[:len(arrived)])
@@ -144,15 +145,16 @@ def distance_loss(network: Policy, latents: Latents, rollout: Rollout) -> Tensor
     return masked_mean(loss, rollout.valid)
 
 
-def imitation_loss(network: Policy, latents: Latents, rollout: Rollout) -> Tensor:
+def imitation_loss(network: Policy, latents: Latents, rollout: Rollout, key: str) -> Tensor:
     """Cross-entropy of a teacher's actions in the states that the policy itself comes to.
 
-    The teacher must be one that the policy can follow: it knows no more than a robot could have
-    seen (`vn_sim_bridge.explorer`). Weighted down to nothing in the course of a training, so that
-    reinforcement has the last word (Ross et al. 2011; Schmitt et al., arXiv 1803.03835).
+    The teacher must be one that the policy can follow: one that knows no more than a robot could
+    have seen (`vn_sim_bridge.explorer`), or, in a house known by heart, the shortest path. `key`
+    names its actions among the privileged. Weighted down to nothing in the course of a training,
+    so that reinforcement has the last word (Ross et al. 2011; Schmitt et al., arXiv 1803.03835).
     """
     logits = network.actor(latents.hidden[:len(rollout.valid)])
-    action = _privileged(rollout, 'explorer_action')[:len(rollout.valid)]
+    action = _privileged(rollout, key)[:len(rollout.valid)]
     loss = F.cross_entropy(logits.flatten(0, 1), action.flatten(), reduction='none')
     return masked_mean(loss, rollout.valid.flatten())
 

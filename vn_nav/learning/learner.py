@@ -7,6 +7,8 @@ probabilities is 1 and its gradient that of the log-probability (Huang et al., a
 from __future__ import annotations
 
 import dataclasses
+import io
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,10 +17,12 @@ from torch import Tensor
 
 from vn_nav.errors import UserError
 from vn_nav.learning import auxiliary
+from vn_nav.learning.distributed import Processes
 from vn_nav.learning.replay import Replay
-from vn_nav.learning.returns import generalised_advantages, masked_mean, normalise
+from vn_nav.learning.returns import generalised_advantages, masked_mean
 from vn_nav.learning.rollout import Rollout
 from vn_nav.observation import Observation
+from vn_nav.policy.checkpoint import write_file
 from vn_nav.policy.network import IMAGE_HEADS, Policy, RecurrentState
 
 # Tasks whose weight is a field of `LearnerConfig`. The first three learn from the replay memory.
@@ -28,15 +32,16 @@ HEADLESS = ('value_replay', 'imitation')  # they learn through critic and actor
 # What the environment has to tell beside the observation, by task.
 PRIVILEGED = {'depth': ('depth',), 'segmentation': ('segmentation',),
               'goal_segmentation': ('goal_segmentation',), 'goal_pose': ('goal_pose', 'overlap'),
-              'arrival': ('arrived',), 'distance': ('distance',),
-              'imitation': ('explorer_action',)}
+              'arrival': ('arrived',), 'distance': ('distance',)}
+TEACHERS = ('explorer', 'oracle')
 
 
 @dataclasses.dataclass(frozen=True)
 class LearnerConfig:
     """Numbers of one update. A weight of 0 switches an auxiliary task off."""
 
-    optimiser: str = 'adam'  # or 'rmsprop' (alpha 0.99, epsilon 1e-5)
+    optimiser: str = 'adam'  # or 'rmsprop' (alpha 0.99)
+    rmsprop_epsilon: float = 1e-5
     learning_rate: float = 4e-4  # at the start
     final_learning_rate: float = 4e-5
     gamma: float = 0.99  # discount
@@ -63,6 +68,9 @@ class LearnerConfig:
     distance: float = 0.0
     imitation: float = 0.0  # at the start
     imitation_until: float = 0.7  # share of the training at which it has fallen to 0
+    # Whom to imitate: one that knows what the robot has seen, or the shortest path, which only a
+    # policy that knows the house by heart can follow.
+    teacher: str = 'explorer'
     # The replay memory, used by `REPLAY_TASKS`, and by the image heads if `images_from_replay`.
     images_from_replay: bool = True
     replay_steps: int = 32_000  # of all environments together
@@ -74,7 +82,8 @@ class LearnerConfig:
 
     def __post_init__(self):
         positive = ('learning_rate', 'final_learning_rate', 'max_gradient_norm', 'epochs',
-                    'minibatches', 'replay_steps', 'replay_batch', 'replay_length')
+                    'minibatches', 'replay_steps', 'replay_batch', 'replay_length',
+                    'rmsprop_epsilon')
         for name in positive:
             value = getattr(self, name)
             if not value > 0 and not (name == 'final_learning_rate' and value == 0):
@@ -88,6 +97,9 @@ class LearnerConfig:
             if not getattr(self, name) >= 0:
                 raise UserError(f'the weight {name} is not negative', getattr(self, name),
                                 'correct it')
+        if self.teacher not in TEACHERS:
+            raise UserError(f'the teacher is one of {", ".join(TEACHERS)}', self.teacher,
+                            'choose one')
         if self.optimiser not in ('adam', 'rmsprop'):
             raise UserError('the optimiser is adam or rmsprop', self.optimiser, 'choose one')
 
@@ -104,7 +116,8 @@ class LearnerConfig:
     @property
     def privileged(self) -> tuple[str, ...]:
         """What batches must hold beside the observations."""
-        return tuple(key for name in self.tasks for key in PRIVILEGED.get(name, ()))
+        keys = [key for name in self.tasks for key in PRIVILEGED.get(name, ())]
+        return tuple(keys) + ((f'{self.teacher}_action',) if self.imitation else ())
 
     @property
     def from_replay(self) -> tuple[str, ...]:
@@ -123,15 +136,19 @@ class Learner:
     Args:
         network: its parameters are changed in place, its `compute_dtype` is used.
         config: numbers of the update.
-        generator: source of the order of environments and of replayed samples.
+        generator: source of the order of environments and of replayed samples, on the network's
+            device.
         replay: the memory that `config.from_replay` learns from; fed by `update`.
-        average_gradients: called with the parameters between backward and step; for training on
-            several processes.
+        average_gradients: called with the parameters between backward and clipping, to average
+            gradients in another way than `processes` does, or to look at them.
+        processes: those that train together; each updates with its own rollout at a time, and
+            the step is that of one process with all their batches.
     """
 
     def __init__(self, network: Policy, config: LearnerConfig, generator: torch.Generator, *,
                  replay: Replay | None = None,
-                 average_gradients: Callable[[list[Tensor]], None] | None = None):
+                 average_gradients: Callable[[list[Tensor]], None] | None = None,
+                 processes: Processes | None = None):
         missing = [name for name in config.heads if name not in network.heads]
         if missing:
             raise UserError('the network has a head for every auxiliary task', missing,
@@ -141,13 +158,20 @@ class Learner:
                             'pass one, or set their weights to 0')
         self.network, self.config, self.generator = network, config, generator
         self.replay, self.average_gradients = replay, average_gradients
+        self.processes = processes or Processes()
+        # Look at each step's loss before the step is made. On a GPU the host would wait for every
+        # step: there it looks once an update.
+        self.prompt = network.device.type == 'cpu'
+        self.objective = self.processes.objective(
+            network, self._loss, unused=set(network.heads) != set(config.heads))
         self.failed_batch: Path | None = None  # where to leave a batch whose loss is not finite
-        parameters = list(network.parameters())
+        parameters = [part for part in network.parameters() if part.requires_grad]
         if config.optimiser == 'adam':
-            self.optimiser = torch.optim.Adam(parameters, config.learning_rate, eps=1e-5)
+            self.optimiser = torch.optim.Adam(parameters, config.learning_rate, eps=1e-5,
+                                              fused=True)
         else:
             self.optimiser = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99,
-                                                 eps=1e-5)
+                                                 eps=config.rmsprop_epsilon)
 
     def update(self, rollout: Rollout, progress: float = 0.0) -> Losses:
         """Several epochs over one rollout, each step with every auxiliary task.
@@ -160,7 +184,8 @@ class Learner:
             `BASIC_LOSSES` and the unweighted loss of each task, means over the steps.
 
         Raises:
-            UserError: a loss or gradient is not finite; the weights are those before that step.
+            UserError: a loss or gradient is not finite; the weights are those before that step
+                (on a GPU, where it is found at the end of the update, they are lost).
         """
         config = self.config
         rate = _linear(config.learning_rate, config.final_learning_rate, progress)
@@ -181,21 +206,47 @@ class Learner:
                                            gamma=config.gamma, lam=config.lam)
         target = advantage + rollout.value[:-1]
         if config.normalise_advantage:
-            advantage = normalise(advantage, rollout.valid)
+            advantage = self.processes.normalise(advantage, rollout.valid)
         names = (*BASIC_LOSSES, *config.tasks)
-        totals, updates = torch.zeros(len(names)), 0
+        totals, updates = torch.zeros(len(names), device=rollout.action.device), 0
         environments = rollout.action.shape[1]
+        if not self.prompt:
+            rollout = dataclasses.replace(rollout, observation=_few_goals(rollout.observation))
         for _ in range(config.epochs):
-            order = torch.randperm(environments, generator=self.generator)
+            order = torch.randperm(environments, generator=self.generator,
+                                   device=self.generator.device)
             for columns in order.chunk(config.minibatches):
-                totals += self._step(select(rollout, columns), advantage[:, columns],
-                                     target[:, columns], entropy_coefficient)
+                totals += self._step(select(rollout, columns, few_goals=self.prompt),
+                                     advantage[:, columns], target[:, columns],
+                                     entropy_coefficient)
                 updates += 1
-        return dict(zip(names, (totals / updates).tolist(), strict=True))
+        losses = dict(zip(names, (totals / updates).tolist(), strict=True))
+        if not self.prompt and not all(map(math.isfinite, losses.values())):
+            self._give_up(rollout, advantage, target, dict(zip(names, totals / updates,
+                                                               strict=True)))
+        return losses
 
     def _step(self, batch: Rollout, advantage: Tensor, target: Tensor,
               entropy_coefficient: float) -> Tensor:
         """One step of the optimiser: one loss, one backward pass, one clipping of the norm."""
+        self._drawn: dict[str, object] = {}
+        with self.processes.counted_together():
+            loss, figures = self.objective(batch, advantage, target, entropy_coefficient)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        parameters = [p for p in self.network.parameters() if p.grad is not None]
+        if self.average_gradients is not None:
+            self.average_gradients(parameters)
+        norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.max_gradient_norm)
+        figures['gradient_norm'] = norm
+        if self.prompt and not torch.isfinite(loss + norm):
+            self._give_up(batch, advantage, target, figures)
+        self.optimiser.step()
+        return torch.stack([figures[name] for name in (*BASIC_LOSSES, *self.config.tasks)])
+
+    def _loss(self, batch: Rollout, advantage: Tensor, target: Tensor,
+              entropy_coefficient: float) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted sum of all losses, and by name what there is to say of them."""
         config, valid = self.config, batch.valid
         latents, _ = self.network.latents(_rows(batch.observation), batch.starts[:-1], batch.state)
         output = self.network.read(latents)
@@ -219,23 +270,13 @@ class Learner:
             else:
                 extra[name] = self._rollout_loss(name, latents, batch)
             loss = loss + self._weights[name] * extra[name]
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        parameters = [p for p in self.network.parameters() if p.grad is not None]
-        if self.average_gradients is not None:
-            self.average_gradients(parameters)
-        norm = torch.nn.utils.clip_grad_norm_(parameters, config.max_gradient_norm)
-        if not torch.isfinite(loss + norm):
-            self._give_up(batch, {
-                'policy': policy_loss, 'value': value_loss, 'entropy': entropy, **extra,
-                'gradient': norm})
-        self.optimiser.step()
         with torch.no_grad():
             kl = masked_mean(ratio - 1 - log_ratio, valid)  # never negative
             share = (masked_mean(((ratio - 1).abs() > config.clip).float(), valid)
-                     if config.clip is not None else torch.zeros(()))
-            return torch.stack([policy_loss, value_loss, entropy, kl, share, norm,
-                                *extra.values()])
+                     if config.clip is not None else kl.new_zeros(()))
+        figures = {'policy_loss': policy_loss, 'value_loss': value_loss, 'entropy': entropy,
+                   'kl': kl, 'clipped': share, **extra}
+        return loss, {name: value.detach() for name, value in figures.items()}
 
     def _rollout_loss(self, name: str, latents, batch: Rollout) -> Tensor:
         """Loss of a task on the batch of the policy itself."""
@@ -243,8 +284,10 @@ class Learner:
             return auxiliary.image_loss(self.network, name, latents, batch)
         if name == 'goal_pose':
             return auxiliary.goal_pose_loss(latents, batch)
-        loss = {'arrival': auxiliary.arrival_loss, 'distance': auxiliary.distance_loss,
-                'imitation': auxiliary.imitation_loss}[name]
+        if name == 'imitation':
+            return auxiliary.imitation_loss(self.network, latents, batch,
+                                            f'{self.config.teacher}_action')
+        loss = {'arrival': auxiliary.arrival_loss, 'distance': auxiliary.distance_loss}[name]
         return loss(self.network, latents, batch)
 
     def _replayed_loss(self, name: str) -> Tensor:
@@ -253,8 +296,10 @@ class Learner:
         if name == 'reward_prediction':
             seen, label = self.replay.reward_frames(config.replay_batch, self.generator,
                                                     unrewarded=config.unrewarded)
+            self._drawn[name] = {'observation': seen._asdict(), 'label': label}
             return auxiliary.reward_prediction_loss(network, network.maps(seen), label)
         window = self.replay.windows(config.replay_batch, config.replay_length, self.generator)
+        self._drawn[name] = window
         if name in IMAGE_HEADS:
             latents = network.latents(_rows(window.observation), window.starts[:-1])[0]
             return auxiliary.image_loss(network, name, latents, window)
@@ -267,28 +312,59 @@ class Learner:
                                             gamma=config.pixel_control_gamma,
                                             grey=config.pixel_change_grey)
 
-    def _give_up(self, batch: Rollout, values: dict[str, Tensor]) -> None:
+    def _give_up(self, batch: Rollout, advantage: Tensor, target: Tensor,
+                 figures: dict[str, Tensor]) -> None:
+        """Leave what the step was computed from, and end the training.
+
+        `torch.load(path)` gives plain values and tensors: `batch` (the fields of `Rollout`, one
+        minibatch), `advantage` and `target` [T,B] as the losses used them, `losses` by name,
+        `replayed` (what was drawn for each task whose loss is not finite) and the `network`'s
+        weights before the step.
+        """
         where = ''
         if self.failed_batch is not None:
-            torch.save({'batch': dataclasses.asdict(batch),
-                        'losses': {name: float(value) for name, value in values.items()},
-                        'network': self.network.state_dict()}, self.failed_batch)
-            where = f'; the batch is in {self.failed_batch}'
+            drawn = {name: part for name, part in self._drawn.items()
+                     if not torch.isfinite(figures[name])}
+            buffer = io.BytesIO()
+            torch.save({
+                'batch': _plain(batch), 'advantage': advantage, 'target': target,
+                'losses': {name.removesuffix('_loss'): float(value)
+                           for name, value in figures.items()},
+                'replayed': {name: _plain(part) for name, part in drawn.items()},
+                'network': self.network.state_dict()}, buffer)
+            try:
+                self.failed_batch.parent.mkdir(parents=True, exist_ok=True)
+                write_file(self.failed_batch, buffer.getvalue())
+                where = f'; the batch is in {self.failed_batch} (torch.load reads it)'
+            except OSError as error:
+                where = f'; the batch could not be written to {error.filename}: {error.strerror}'
         raise UserError('losses and gradients stay finite',
-                        ', '.join(f'{name} {float(value):g}' for name, value in values.items()),
+                        ', '.join(f'{name} {float(value):g}' for name, value in figures.items()),
                         f'lower the learning rate and resume from the last checkpoint{where}')
 
 
-def select(rollout: Rollout, columns: Tensor) -> Rollout:
-    """Some environments of a rollout, with only the goals that occur in them.
+def _plain(part: Rollout | dict) -> dict:
+    """As a dictionary that `torch.load` trusts, and the network's goals once."""
+    if isinstance(part, dict):
+        return part
+    rows = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+    state = None if part.state is None else part.state._asdict()
+    return {**rows, 'observation': part.observation._asdict(), 'state': state}
 
-    Pictures stay channels last in memory.
+
+def select(rollout: Rollout, columns: Tensor, few_goals: bool = True) -> Rollout:
+    """Some environments of a rollout, with only the goals that occur in them, or with all.
+
+    Pictures stay channels last in memory. To find the goals, the host waits for the device.
     """
     seen = rollout.observation
-    image = seen.image.permute(0, 1, 3, 4, 2)[:, columns].permute(0, 1, 4, 2, 3)
-    used, index = torch.unique(seen.goal_index[:, columns], return_inverse=True)
-    observation = Observation(image, seen.goals[used], index, seen.last_action[:, columns],
-                              seen.last_reward[:, columns])
+    # index_select copies whole pictures; plain indexing takes ten times as long.
+    image = seen.image.permute(0, 1, 3, 4, 2).index_select(1, columns).permute(0, 1, 4, 2, 3)
+    extras = seen.extras and {key: rows[:, columns] for key, rows in seen.extras.items()}
+    observation = Observation(image, seen.goals, seen.goal_index[:, columns],
+                              seen.last_action[:, columns], seen.last_reward[:, columns], extras)
+    if few_goals:
+        observation = _few_goals(observation)
 
     def part(rows: Tensor | None) -> Tensor | None:
         return None if rows is None else rows[:, columns]
@@ -301,10 +377,18 @@ def select(rollout: Rollout, columns: Tensor) -> Rollout:
         log_probability=part(rollout.log_probability), value=part(rollout.value))
 
 
+def _few_goals(observation: Observation) -> Observation:
+    """With only the goals that occur in it."""
+    used, index = torch.unique(observation.goal_index, return_inverse=True)
+    return observation._replace(goals=observation.goals[used], goal_index=index)
+
+
 def _rows(observation: Observation) -> Observation:
     """All rows but the last, which only bootstraps."""
+    extras = observation.extras
     return Observation(observation.image[:-1], observation.goals,
-                       *(rows[:-1] for rows in observation[2:]))
+                       *(rows[:-1] for rows in observation[2:5]),
+                       extras and {key: rows[:-1] for key, rows in extras.items()})
 
 
 def _linear(first: float, last: float, progress: float) -> float:

@@ -9,12 +9,14 @@ starts from it; every number can be changed from the command line.
 | `unreal` | the same without the three image heads (thesis, 5.7; Jaderberg et al. 2016) |
 | `a2c` | the same without any auxiliary task |
 | `framestack` | `unreal` with the last four pictures and a linear layer instead of the LSTM (thesis, 5.4) |
-| `fast` | PPO, early fusion, GAE, Adam, success-driven curriculum, and goal poses |
+| `icra2017` | Zhu et al. 2017: frozen features of four pictures, siamese layers, layers of its own for each scene; 10 at the goal, -0.01 a step (sections IV-B and IV-C) |
+| `fast` | PPO, early fusion, GAE, Adam, a success-driven curriculum; goal poses; imitation of a teacher that is weighted down to nothing |
 """  # noqa: E501
 
 from __future__ import annotations
 
 import dataclasses
+import re
 
 from vn_nav.errors import UserError
 from vn_nav.learning.learner import LearnerConfig
@@ -39,6 +41,10 @@ class TrainConfig(LearnerConfig):
     stacked_frames: int = 1
     deconvolutions: int | None = None  # None: one below `LARGE` pixels, else two (table 5.1)
     pose_to_memory: bool = False
+    # Of icra2017: the file with the weights of ResNet-50 (without one: the small random encoder),
+    # and the scenes with layers of their own (house i of the environment is scene i).
+    frozen_weights: str = ''
+    scenes: int = 1
     pixel_mean: float = 120.0
     pixel_std: float = 36.0
     # Before the first frame: the encoder learns from picture pairs, see `vn_nav.learning.pairs`.
@@ -50,6 +56,7 @@ class TrainConfig(LearnerConfig):
     difficulty_step: float = 0.1
     advance_window: int = 200  # episodes
     seed: int = 0
+    device: str = 'cpu'  # of the network, and of `vn_nav train`'s simulator; or cuda:0
     bf16: bool | None = None  # None: where the processor multiplies bfloat16 in hardware
     threads: int = 1  # of torch
     checkpoint_seconds: float = 60.0
@@ -72,7 +79,14 @@ class TrainConfig(LearnerConfig):
              'picture pairs teach the task goal_pose: pair_minutes needs its weight',
              self.pair_minutes),
             (self.pair_houses >= 1, 'pair_houses is positive', self.pair_houses),
+            (self.architecture == 'icra2017' or not self.frozen_weights,
+             'only the architecture icra2017 has a frozen encoder to give weights to',
+             self.frozen_weights),
+            (self.architecture != 'icra2017' or not self.tasks,
+             'the architecture icra2017 learns no auxiliary tasks', self.tasks),
             (self.threads >= 1, 'threads is at least 1', self.threads),
+            (re.fullmatch(r'cpu|cuda(:\d+)?', self.device),
+             'the device is cpu, or a GPU by its number, such as cuda:0', self.device),
         )
         for kept, rule, received in rules:
             if not kept:
@@ -86,7 +100,8 @@ class TrainConfig(LearnerConfig):
             blocks=self.blocks, features=self.features, hidden=self.hidden,
             frames=self.stacked_frames, heads=self.heads, deconvolutions=deconvolutions,
             pose_to_memory=self.pose_to_memory, pixel_mean=self.pixel_mean,
-            pixel_std=self.pixel_std)
+            pixel_std=self.pixel_std, frozen='resnet50' if self.frozen_weights else '',
+            scenes=self.scenes)
 
 
 _A2C = {
@@ -103,13 +118,19 @@ PRESETS: dict[str, dict] = {
     'a2c': _A2C,
     'unreal': _UNREAL,
     'framestack': _UNREAL | {'stacked_frames': 4},
+    'icra2017': _A2C | {
+        'architecture': 'icra2017', 'stacked_frames': 4, 'rollout_length': 5,
+        'entropy_coefficient': 0.01, 'final_entropy_coefficient': 0.01, 'rmsprop_epsilon': 0.1,
+        # Ours: under 0.5 an epsilon of 0.1 would leave the weights all but where they are.
+        'max_gradient_norm': 40.0, 'start_difficulty': 1.0,
+    },
     'thesis': _UNREAL | {'depth': 0.1, 'segmentation': 0.1, 'goal_segmentation': 0.1},
     'fast': {
         'learning_rate': 4e-4, 'final_learning_rate': 4e-5, 'clip': 0.2, 'epochs': 2,
         'minibatches': 4, 'entropy_coefficient': 0.008, 'final_entropy_coefficient': 0.003,
         'frames': 1_600_000, 'rollout_length': 32, 'channels': (16, 32, 64), 'features': 256,
         'hidden': 256, 'goal_pose': 0.5, 'arrival': 0.2, 'distance': 0.1,
-        'pose_to_memory': True, 'pair_minutes': 5.0,
+        'pose_to_memory': True, 'pair_minutes': 5.0, 'imitation': 1.0, 'imitation_until': 0.6,
     },
 }
 _THESIS_ENVIRONMENT = {'envs': 16, 'max_decisions': 900, 'progress_reward': 0.0,
@@ -117,6 +138,7 @@ _THESIS_ENVIRONMENT = {'envs': 16, 'max_decisions': 900, 'progress_reward': 0.0,
 # What each preset learns in, as options of `vn_nav train`.
 ENVIRONMENT: dict[str, dict] = {
     **{name: _THESIS_ENVIRONMENT for name in PRESETS},
+    'icra2017': _THESIS_ENVIRONMENT | {'goal_bonus': 9.0, 'step_reward': -0.01},
     'fast': {'envs': 64, 'max_decisions': 300, 'progress_reward': 1.0, 'collision_reward': -0.02},
 }
 

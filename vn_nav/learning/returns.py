@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
+
 import torch
 from torch import Tensor
+
+_count: Callable[[Tensor], Tensor] | None = None  # see `counted_together`
 
 
 def generalised_advantages(reward: Tensor, value: Tensor, terminated: Tensor, truncated: Tensor,
@@ -96,8 +101,25 @@ def n_step_q(reward: Tensor, bootstrap: Tensor, terminated: Tensor, valid: Tenso
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean of x over the rows where the boolean mask holds; 0 where it holds nowhere."""
+    count = mask.sum()
+    count = count.clamp(min=1) if _count is None else _count(count)
     # where, not multiplication: a masked row may hold NaN.
-    return torch.where(mask, x, 0.0).sum() / mask.sum().clamp(min=1)
+    return torch.where(mask, x, 0.0).sum() / count
+
+
+@contextlib.contextmanager
+def counted_together(count: Callable[[Tensor], Tensor]) -> Iterator[None]:
+    """Let masked means divide by another count than their own, as several processes need it.
+
+    Args:
+        count: from a number of rows of this process to the one to divide by, positive.
+    """
+    global _count
+    before, _count = _count, count
+    try:
+        yield
+    finally:
+        _count = before
 
 
 def normalise(advantage: Tensor, mask: Tensor) -> Tensor:

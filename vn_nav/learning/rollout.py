@@ -9,6 +9,7 @@ action of that row, so it is no frame (`valid` is False). Row t+2 begins the nex
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
+from vn_nav.policy.zhu import check_scenes
 
 
 @dataclasses.dataclass
@@ -59,10 +61,15 @@ class Episode(NamedTuple):
 class Collector:
     """Acts in an environment by sampling, and keeps both their states between rollouts.
 
+    Everything lives on the network's device. Of an environment on that device (its `goals` are a
+    tensor, as `vn_sim_bridge.warp_env.WarpNavigationEnv`'s are) nothing passes through the host
+    while it acts, and the host waits for the device once a rollout, to read the episodes.
+
     Args:
-        env: a vector environment that observes as `vn_sim_bridge.env.NavigationEnv` does.
+        env: a vector environment that observes as `vn_sim_bridge.env.NavigationEnv` does; tensors
+            may change in place with its next step.
         network: the policy; it acts in its `compute_dtype`.
-        generator: source of the sampled actions.
+        generator: source of the sampled actions, on the network's device.
         privileged: keys of the environment's `info` to keep beside the observations.
     """
 
@@ -70,118 +77,183 @@ class Collector:
                  privileged: tuple[str, ...] = ()):
         self.env, self.network, self.generator = env, network, generator
         self.privileged = privileged
-        self.told: dict[str, np.ndarray] = {}  # beside the present observation
-        self.goals = torch.from_numpy(np.ascontiguousarray(env.goals))
+        self.device = network.device
+        self.on_device = isinstance(env.goals, Tensor)
+        self.told: dict[str, Tensor] = {}  # beside the present observation
+        self.goals = self._tensor(env.goals)
+        if network.frozen:
+            self.goals = network.look(self.goals)
+        self._scenes = network.config.scenes
         n = env.num_envs
-        self.observation: dict[str, np.ndarray] = {}
-        self.starts = torch.ones(n, dtype=torch.bool)
+        self.observation: dict[str, Tensor] = {}
+        self.starts = torch.ones(n, dtype=torch.bool, device=self.device)
         self.state = network.initial_state(n)
-        self.number = np.zeros(n, np.int64)  # of each environment's present episode
-        self._reward = np.zeros(n)
-        self._decisions = np.zeros(n, np.int64)
-        self._collisions = np.zeros(n, np.int64)
+        # Of each environment's present episode: its number, return, decisions and collisions.
+        self._totals = tuple(torch.zeros(n, dtype=dtype, device=self.device) for dtype in (
+            torch.int64, torch.float64, torch.int64, torch.int64))
+
+    @property
+    def number(self) -> np.ndarray:
+        """[N] number of each environment's present episode; this waits for the device."""
+        return self._totals[0].cpu().numpy()
 
     def begin(self, seed: int) -> None:
         """Reset every environment."""
-        self.observation, info = self.env.reset(seed=seed)
-        self.told = self._tell(info)
-        self.starts[:] = True
-        self.number += 1
-        for total in (self._reward, self._decisions, self._collisions):
-            total[:] = 0
+        self._see(*self.env.reset(seed=seed))
+        self.starts = torch.ones_like(self.starts)
+        number, *others = self._totals
+        number += 1
+        for total in others:
+            total.zero_()
 
     @torch.no_grad()
     def collect(self, steps: int) -> tuple[Rollout, list[Episode]]:
         """Act for a number of steps; also the episodes that ended, in the order of their ends."""
-        n, size = self.env.num_envs, self.goals.shape[-1]
+        n, size = self.env.num_envs, self.observation['image'].shape[-1]
         flag, real, whole = torch.bool, torch.float32, torch.int64
 
-        def empty(length: int, dtype: torch.dtype) -> Tensor:
-            return torch.empty(length, n, dtype=dtype)
+        def empty(length: int, dtype: torch.dtype, *shape: int) -> Tensor:
+            return torch.empty(length, n, *shape, dtype=dtype, device=self.device)
 
         # Channels last, as the convolutions read them.
-        image = torch.empty(steps + 1, n, size, size, 3, dtype=torch.uint8).permute(0, 1, 4, 2, 3)
+        image = empty(steps + 1, torch.uint8, size, size, 3).permute(0, 1, 4, 2, 3)
         seen = Observation(image, self.goals, empty(steps + 1, whole), empty(steps + 1, whole),
-                           empty(steps + 1, real))
-        told = {key: torch.empty(steps + 1, *rows.shape, dtype=torch.from_numpy(rows).dtype)
+                           empty(steps + 1, real), self._empty_extras(steps + 1))
+        told = {key: empty(steps + 1, rows.dtype, *rows.shape[1:])
                 for key, rows in self.told.items()}
         rollout = Rollout(
             seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
             empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, told,
             empty(steps, real), empty(steps + 1, real))
-        goal_maps = GoalMaps(self.network)
-        episodes: list[Episode] = []
+        facts = empty(steps, torch.float64, 1 + len(self._totals))
+        goal_maps = self._goal_maps()
         for t in range(steps + 1):
             for name, rows in seen._asdict().items():
-                if name != 'goals':
-                    rows[t] = torch.from_numpy(self.observation[name])
+                if name not in ('goals', 'extras'):
+                    rows[t] = self.observation[name]
+            self._fill_extras(seen, t)
             for key, rows in told.items():
-                rows[t] = torch.from_numpy(self.told[key])
+                rows[t] = self.told[key]
             rollout.starts[t] = self.starts
             now = slice(t, t + 1)
-            row = Observation(image[now], None, None, *(part[now] for part in seen[3:]))
+            extras = seen.extras and {key: rows[now] for key, rows in seen.extras.items()}
+            row = Observation(image[now], None, None, seen.last_action[now],
+                              seen.last_reward[now], extras)
             output, state = self.network(row, rollout.starts[now], self.state,
-                                         goal_maps.of(self.goals, seen.goal_index[t]))
+                                         goal_maps(seen.goal_index[t]))
             rollout.value[t] = output.value[0]
             if t == steps:
                 break  # this observation only bootstraps; the next rollout begins with it
             self.state = state
             log_probability = torch.log_softmax(output.logits[0], dim=-1)
-            action = torch.multinomial(log_probability.exp(), 1, generator=self.generator)
+            action = self._sample(log_probability)
             rollout.action[t] = action[:, 0]
             rollout.log_probability[t] = log_probability.gather(1, action)[:, 0]
-            self._step(rollout, t, episodes)
-        return rollout, episodes
+            facts[t] = self._step(rollout, t)
+        return rollout, _episodes(rollout.terminated | rollout.truncated, facts)
 
-    def _tell(self, info: dict) -> dict[str, np.ndarray]:
+    def _tensor(self, rows) -> Tensor:
+        """Rows of the environment, on the network's device; shared where they are there."""
+        if not isinstance(rows, Tensor):
+            rows = torch.from_numpy(np.ascontiguousarray(rows))
+        return rows.to(self.device)
+
+    def _goal_maps(self) -> Callable[[Tensor], Tensor]:
+        """Goal maps by index: on a device all at once, for it cannot say which ones changed."""
+        if not self.on_device:
+            maps = GoalMaps(self.network)
+            return lambda index: maps.of(self.goals, index)
+        table = self.network.encode_goals(self.goals)
+        return lambda index: table[index]
+
+    def _sample(self, log_probability: Tensor) -> Tensor:
+        """Actions [N,1]: what torch.multinomial draws, without its look at the probabilities."""
+        weights = log_probability.exp()
+        waiting = torch.empty_like(weights).exponential_(generator=self.generator)
+        return (weights / waiting).argmax(dim=-1, keepdim=True)
+
+    def _empty_extras(self, steps: int) -> dict[str, Tensor] | None:
+        """Room for what only the architecture icra2017 looks at."""
+        if not self.network.frozen:
+            return None
+        n, features = self.env.num_envs, self.network.encoder.frozen.features
+        extras = {'features': torch.empty(steps, n, features, device=self.device)}
+        if self._scenes > 1:
+            extras['scene'] = torch.empty(steps, n, dtype=torch.int64, device=self.device)
+        return extras
+
+    def _fill_extras(self, seen: Observation, t: int) -> None:
+        if seen.extras is None:
+            return
+        # Never encoded again: not by the learner either.
+        seen.extras['features'][t] = self.network.look(seen.image[t])
+        if self._scenes > 1:
+            scene = self.env.house_index
+            if self.on_device:
+                scene = scene.cpu().numpy()  # a wait that only these networks pay for
+            seen.extras['scene'][t] = self._tensor(check_scenes(scene, self._scenes))
+
+    def _see(self, observation: dict, info: dict) -> None:
+        """Keep what the environment shows and tells until the next row."""
         missing = [key for key in self.privileged if key not in info]
         if missing:
             raise UserError('the environment tells everything that the auxiliary tasks need',
                             missing, 'list it among its privileged outputs, or set the weight of '
                             'those tasks to 0')
-        return {key: np.array(info[key]) for key in self.privileged}
+        self.observation = {name: self._tensor(rows) for name, rows in observation.items()}
+        self.told = {key: self._tensor(info[key]) for key in self.privileged}
 
-    def _step(self, rollout: Rollout, t: int, episodes: list[Episode]) -> None:
-        """Step the environment with row t's actions and write down what came of it."""
-        self.observation, reward, terminated, truncated, info = self.env.step(
-            rollout.action[t].numpy())
-        self.told = self._tell(info)
-        reset = np.asarray(info['reset'])
-        rollout.reward[t] = torch.from_numpy(np.asarray(reward, np.float32))
-        rollout.terminated[t] = torch.from_numpy(terminated)
-        rollout.truncated[t] = torch.from_numpy(truncated)
-        self.starts = torch.from_numpy(reset.copy())
-        rollout.valid[t] = ~self.starts
-        self.number += reset
-        for total in (self._reward, self._decisions, self._collisions):
-            total[reset] = 0
-        self._reward += np.where(reset, 0.0, reward)
-        self._decisions += ~reset
-        self._collisions += info['collided'] & ~reset
-        for e in np.nonzero(terminated | truncated)[0]:
-            episodes.append(Episode(
-                int(e), int(self.number[e]), bool(info['success'][e]), float(self._reward[e]),
-                int(self._decisions[e]), int(self._collisions[e])))
+    def _step(self, rollout: Rollout, t: int) -> Tensor:
+        """Step the environment with row t's actions and write down what came of it.
+
+        Returns:
+            [N,5] float64, of each environment's episode: success and `_totals`.
+        """
+        action = rollout.action[t]
+        observation, reward, terminated, truncated, info = self.env.step(
+            action if self.on_device else action.cpu().numpy())
+        self._see(observation, info)
+        reward, reset = self._tensor(reward), self._tensor(info['reset'])
+        rollout.reward[t] = reward
+        rollout.terminated[t] = self._tensor(terminated)
+        rollout.truncated[t] = self._tensor(truncated)
+        self.starts = reset
+        rollout.valid[t] = ~reset
+        number, total, decisions, collisions = self._totals
+        number += reset
+        for part in (total, decisions, collisions):
+            part.masked_fill_(reset, 0)
+        total += torch.where(reset, 0.0, reward)
+        decisions += ~reset
+        collisions += self._tensor(info['collided']) & ~reset
+        return torch.stack([self._tensor(info['success']), *self._totals], dim=1)
 
     def state_dict(self) -> dict:
         """Everything but the environment, as plain tensors."""
+        def copy(rows: Tensor) -> Tensor:
+            return rows.detach().clone().cpu()
         return {
-            'observation': {name: torch.from_numpy(np.array(rows))
-                            for name, rows in self.observation.items()},
-            'told': {key: torch.from_numpy(rows) for key, rows in self.told.items()},
-            'starts': self.starts.clone(),
-            'memory': [part.clone() for part in self.state],
-            'totals': [torch.from_numpy(total.copy()) for total in self._totals()],
+            'observation': {name: copy(rows) for name, rows in self.observation.items()},
+            'told': {key: copy(rows) for key, rows in self.told.items()},
+            'starts': copy(self.starts),
+            'memory': [copy(part) for part in self.state],
+            'totals': [copy(total) for total in self._totals],
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Go on where `state_dict` was taken; the environment must stand there too."""
-        self.observation = {name: rows.numpy() for name, rows in state['observation'].items()}
-        self.told = {key: rows.numpy() for key, rows in state['told'].items()}
-        self.starts = state['starts']
-        self.state = RecurrentState(*state['memory'])
-        for total, saved in zip(self._totals(), state['totals'], strict=True):
-            total[:] = saved.numpy()
+        self.observation = {name: self._tensor(rows)
+                            for name, rows in state['observation'].items()}
+        self.told = {key: self._tensor(rows) for key, rows in state['told'].items()}
+        self.starts = self._tensor(state['starts'])
+        self.state = RecurrentState(*map(self._tensor, state['memory']))
+        for total, saved in zip(self._totals, state['totals'], strict=True):
+            total.copy_(saved)
 
-    def _totals(self) -> tuple[np.ndarray, ...]:
-        return self.number, self._reward, self._decisions, self._collisions
+
+def _episodes(ended: Tensor, facts: Tensor) -> list[Episode]:
+    """Episodes that ended in a rollout, [T,N] bool, from what `Collector._step` wrote down."""
+    row, env = ended.nonzero(as_tuple=True)
+    rows = torch.cat([env.unsqueeze(1), facts[row, env]], dim=1).tolist()
+    return [Episode(int(env), int(number), bool(success), reward, int(decisions), int(collisions))
+            for env, success, number, reward, decisions, collisions in rows]

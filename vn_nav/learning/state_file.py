@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -21,12 +24,36 @@ def write_state(path: Path, state: dict) -> None:
     buffer = io.BytesIO()
     torch.save(state, buffer)
     data = buffer.getvalue()
-    try:
+    with written(path):
         write_file(path, hashlib.sha256(data).hexdigest().encode() + b'\n' + data)
+
+
+@contextlib.contextmanager
+def written(path: Path) -> Iterator[None]:
+    """Turn the operating system's errors inside into the one that a user understands.
+
+    Raises:
+        UserError: the disk is full, or the file cannot be written.
+    """
+    try:
+        yield
     except OSError as error:
-        raise UserError(f'the training can write its state ({len(data) / 1e6:.0f} MB)',
-                        f'{path}: {error.strerror}',
-                        'free some space and resume: the last saved state is whole') from error
+        raise UserError('a training can write its files',
+                        f'{error.filename or path}: {error.strerror}',
+                        'free some space, or allow it to write there, and resume: the last saved '
+                        'state is whole') from error
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what killed processes had not finished writing, see `checkpoint.write_file`.
+
+    Only where no other process writes.
+    """
+    for path in folder.glob('.*.tmp*'):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def read_state(path: Path) -> dict:
@@ -39,4 +66,4 @@ def read_state(path: Path) -> dict:
     if hashlib.sha256(data).hexdigest().encode() != digest:
         raise UserError('the training state has the SHA-256 of its first line', str(path),
                         'the file is corrupt: start a new training')
-    return torch.load(io.BytesIO(data), weights_only=True)
+    return torch.load(io.BytesIO(data), weights_only=True, map_location='cpu')

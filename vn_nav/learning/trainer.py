@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
+import contextlib
 import dataclasses
 import math
 import signal
-import sys
 import threading
 import time
 from collections import deque
@@ -18,18 +17,21 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.learning.curriculum import Curriculum, FrameCurriculum
+from vn_nav.learning.distributed import Processes
 from vn_nav.learning.learner import BASIC_LOSSES, TASKS, Learner
+from vn_nav.learning.log import Log
 from vn_nav.learning.pairs import PairConfig, PairSource, pretrain_pairs
 from vn_nav.learning.presets import TrainConfig
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector, Episode
-from vn_nav.learning.state_file import read_state, write_state
-from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint, write_file
+from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
+from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
+from vn_nav.policy.resnet import load_frozen_weights
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
-METRICS, TENSORBOARD = 'metrics.csv', 'tensorboard'
+RANKS_APART, RESUMPTIONS_APART = 10_007, 1_000_003  # between the seeds of processes and lives
 COLUMNS = ('frames', 'minutes', 'fps', 'tau', 'success', 'return', 'length', 'collisions',
            *BASIC_LOSSES, 'collect_seconds', 'update_seconds', *TASKS)
 RECENT = 200  # episodes that the shown success, return, length and collisions are means over
@@ -42,13 +44,21 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
     """Train a policy; SIGINT and SIGTERM save and end it early, cleanly.
 
     The folder gets `checkpoint/`, `training_state`, `metrics.csv` and, if asked for,
-    `tensorboard/`. An interrupted and resumed training repeats the uninterrupted one bit for bit
-    (one thread, no wall-clock limit) if the environment has `get_state() -> dict of arrays` and
-    `set_state(dict)`; otherwise its episodes begin anew.
+    `tensorboard/` and `replay/`. A killed training loses what came after the last save, at most
+    `config.checkpoint_seconds`. Resumed, it repeats the uninterrupted one bit for bit (one
+    thread, no wall-clock limit) if the environment has `get_state() -> dict of arrays` and
+    `set_state(dict)`, otherwise its episodes begin anew; of a replay memory it lacks the steps
+    that the killed one had overwritten. It says what it found.
+
+    Started by torchrun, several processes train one policy (`vn_nav.learning.distributed`):
+    frames are those of all, the first one writes the files, and a process that died is replaced
+    as torchrun was told, all going on from the last save. Then episodes begin anew and replay
+    memories fill anew.
 
     Args:
         env: a vector environment as `vn_sim_bridge.env.NavigationEnv`: `num_envs`, `goals`,
-            `action_names`, `world_version`, `set_difficulty`, NEXT_STEP autoreset.
+            `action_names`, `world_version`, `set_difficulty`, NEXT_STEP autoreset; or one whose
+            rows are tensors on `config.device`, as `vn_sim_bridge.warp_env.WarpNavigationEnv`.
         config: numbers of the training.
         folder: new or empty of an earlier training, unless `resume`.
         resume: go on from the folder's last save.
@@ -62,34 +72,31 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
         The folder of the final checkpoint.
 
     Raises:
-        UserError: a folder or resumption that does not fit, or a loss that is not finite.
+        UserError: a folder or resumption that does not fit, a full disk, or a loss that is not
+            finite; the last save stays as it is.
     """
     folder = Path(folder)
-    training = _Training(env, config, folder, info)
-    # Interrupted before the first frame, a training goes on with its pairs.
-    before_frames = (folder / PAIRS).exists() and not (folder / STATE).exists()
-    if resume and not before_frames:
-        training.load()
-    else:
-        if (folder / STATE).exists():
-            raise UserError('a new training has a folder of its own', str(folder),
-                            'resume the training there, or choose another folder')
-        if init is not None:
-            training.network.load_state_dict(_initial_weights(init, training.network))
-        elif config.pair_minutes and pairs is not None:
-            training.learn_pairs(*pairs())
-        training.begin()
-    with _Signals() as stopped, _Log(folder, config, training.frames) as log:
-        saved = time.monotonic()
-        while not stopped.is_set() and training.progress < 1.0:
-            row = training.update()
-            log.write(row)
-            if on_update is not None:
-                on_update(row)
-            if time.monotonic() - saved >= config.checkpoint_seconds:
-                training.save()
-                saved = time.monotonic()
-        training.save()
+    with Processes.join(config.pair_minutes) as processes:
+        training = _Training(env, config, folder, info, processes)
+        training.start(resume, init, pairs)
+        with _Signals() as stopped, (Log(folder, config, COLUMNS, training.frames)
+                                     if processes.leads else contextlib.nullcontext()) as log:
+            if not training.updates:
+                training.save(log)  # from here on there is something to resume
+            saved = time.monotonic()
+            while not processes.any(stopped.is_set()) and training.progress < 1.0:
+                start = time.monotonic()
+                row = training.update()
+                if log is not None:
+                    log.write(row)
+                if on_update is not None:
+                    on_update(row)
+                now = time.monotonic()
+                # The next update may end too late.
+                if now + (now - start) - saved >= config.checkpoint_seconds:
+                    training.save(log)
+                    saved = time.monotonic()
+            training.save(log)
     return folder / CHECKPOINT
 
 
@@ -120,26 +127,35 @@ def has_fast_bfloat16() -> bool:
 class _Training:
     """Everything that changes while training, and its save file."""
 
-    def __init__(self, env, config: TrainConfig, folder: Path, info: dict):
+    def __init__(self, env, config: TrainConfig, folder: Path, info: dict, processes: Processes):
         torch.set_num_threads(config.threads)
-        self.env, self.config, self.folder = env, config, folder
+        self.env, self.config, self.folder, self.processes = env, config, folder, processes
         self.info = {**info, 'seed': config.seed, 'world_version': env.world_version}
-        size = env.single_observation_space['image'].shape[-1]
+        size = env.goals.shape[-1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = Policy(config.network(tuple(env.action_names), size))
-        bf16 = has_fast_bfloat16() if config.bf16 is None else config.bf16
+        if config.frozen_weights:
+            load_frozen_weights(self.network.encoder.frozen, config.frozen_weights)
+        self.network.to(config.device)
+        bf16 = config.bf16
+        if bf16 is None:
+            bf16 = has_fast_bfloat16() or self.network.device.type == 'cuda'
         self.network.compute_dtype = torch.bfloat16 if bf16 else torch.float32
-        self.generator = torch.Generator().manual_seed(config.seed)
-        self.learner = Learner(self.network, config, self.generator, replay=self._replay(size))
-        self.learner.failed_batch = folder / FAILED_BATCH
+        self.generator = torch.Generator(self.network.device)
+        self.learner = Learner(self.network, config, self.generator, replay=self._replay(size),
+                               processes=processes)
+        # All processes see that a gradient is not finite, whosever batch it came from.
+        self.learner.failed_batch = folder / (
+            f'{processes.rank}-{FAILED_BATCH}' if processes.count > 1 else FAILED_BATCH)
         self.collector = Collector(env, self.network, self.generator, config.privileged)
         if config.curriculum == 'frames':
             self.curriculum = FrameCurriculum(start=config.start_difficulty)
         else:
             self.curriculum = Curriculum(
-                env.num_envs, start=config.start_difficulty, threshold=config.success_to_advance,
-                step=config.difficulty_step, window=config.advance_window)
+                env.num_envs * processes.count, start=config.start_difficulty,
+                threshold=config.success_to_advance, step=config.difficulty_step,
+                window=config.advance_window)
         self.recent: deque[Episode] = deque(maxlen=RECENT)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
         self.clock = time.monotonic()
@@ -148,16 +164,54 @@ class _Training:
         config, env = self.config, self.env
         if not config.from_replay:
             return None
+        device, files = self.network.device, self.processes.count == 1
+
+        def table(rows) -> torch.Tensor:
+            return torch.as_tensor(rows, device=device)
         return Replay(
-            -(-config.replay_steps // env.num_envs), env.num_envs, size,
-            torch.from_numpy(np.ascontiguousarray(env.goals)),
+            # Many environments: at least a rollout and a window that is not all of it.
+            max(-(-config.replay_steps // env.num_envs),
+                config.rollout_length + config.replay_length + 1),
+            env.num_envs, size, table(env.goals),
             privileged=tuple(key for key in config.privileged
                              if key in ('depth', 'segmentation')),
-            goal_segmentation=(torch.from_numpy(env.goal_segmentation)
+            goal_segmentation=(table(env.goal_segmentation)
                                if 'goal_segmentation' in config.privileged else None),
-            directory=self.folder / REPLAY)
+            # Files are the leading process's matter; resumed, all are to have the same share.
+            directory=self.folder / REPLAY if files and device.type == 'cpu' else None,
+            device=device)
 
-    def learn_pairs(self, source: PairSource, validation: PairSource) -> None:
+    def start(self, resume: bool, init: str | Path | None,
+              pairs: Callable[[], tuple[PairSource, PairSource]] | None) -> None:
+        """Go on from the last save, or begin; the arguments are those of `train`."""
+        state = self.processes.told(lambda: self._saved(resume))
+        if state is not None:
+            self._load(state)
+            return
+        if self.processes.leads:
+            if init is not None:
+                self.network.load_state_dict(_initial_weights(init, self.network))
+            elif self.config.pair_minutes and pairs is not None:
+                self._learn_pairs(*pairs())
+        self.processes.copy_weights(self.network)
+        self._begin()
+
+    def _saved(self, resume: bool) -> dict | None:
+        """The state to go on from, if any."""
+        path = self.folder / STATE
+        if path.is_file() and not (resume or self.processes.restarted):
+            raise UserError('a new training has a folder of its own', str(self.folder),
+                            'resume the training there, or choose another folder')
+        # Interrupted before the first frame, a training goes on with its pairs.
+        if resume and not (path.is_file() or (self.folder / PAIRS).exists()
+                           or self.processes.restarted):
+            raise UserError('a training is resumed from its folder', str(path),
+                            'start it without resume, or name the folder of one')
+        for place in (self.folder, self.folder / PAIRS):
+            remove_partial(place)
+        return read_state(path) if path.is_file() else None
+
+    def _learn_pairs(self, source: PairSource, validation: PairSource) -> None:
         """Pre-train the encoder; its time counts."""
         def say(row: dict) -> None:
             print(f'pairs {row["pairs"]:,} · {row["minutes"]:.1f} min · in unseen houses: '
@@ -165,14 +219,18 @@ class _Training:
                   f'{row["validation_heading_deg"]:.0f} deg, overlap '
                   f'{row["validation_overlap_accuracy"]:.0%}', flush=True)
         config = PairConfig(minutes=self.config.pair_minutes)
+        self.network.cpu()  # where pairs are drawn
         pretrain_pairs(self.network, source, validation, self.folder / PAIRS, config, say)
+        self.network.to(self.config.device)
         self.seconds = 60 * self.config.pair_minutes
         self.clock = time.monotonic()
 
-    def begin(self) -> None:
-        """Start from nothing."""
+    def _begin(self, life: int = 0) -> None:
+        """Start episodes and random numbers that no other process or life has seen."""
+        seed = (self.config.seed + RANKS_APART * self.processes.rank + RESUMPTIONS_APART * life)
+        self.generator.manual_seed(seed)
         self.env.set_difficulty(self.curriculum.tau)
-        self.collector.begin(self.config.seed)
+        self.collector.begin(seed)
 
     @property
     def progress(self) -> float:
@@ -187,18 +245,26 @@ class _Training:
         start = time.monotonic()
         rollout, episodes = self.collector.collect(self.config.rollout_length)
         middle = time.monotonic()
-        losses = self.learner.update(rollout, self.progress)
+        with written(self.folder / REPLAY):
+            losses = self.learner.update(rollout, self.progress)
         end = time.monotonic()
-        self.frames += rollout.frames
+        first = self.env.num_envs * self.processes.rank
+        everyone = self.processes.gather((
+            rollout.frames, self.seconds + end - self.clock, losses, self.collector.number,
+            [tuple(episode._replace(env=first + episode.env)) for episode in episodes]))
+        frames, seconds, losses, numbers, episodes = zip(*everyone, strict=True)
+        speed = sum(frames) / (end - self.clock)
+        self.frames += sum(frames)
         self.updates += 1
-        self.seconds += end - self.clock
-        speed = rollout.frames / (end - self.clock)
+        self.seconds = seconds[0]  # the same for all: they have to end together
         self.clock = end
+        episodes = [Episode(*episode) for part in episodes for episode in part]
         self.recent.extend(episodes)
         tau = self.curriculum.tau
-        if self.curriculum.update(episodes, self.collector.number, self.progress):
+        if self.curriculum.update(episodes, np.concatenate(numbers), self.progress):
             self.env.set_difficulty(self.curriculum.tau)
         decisions = max(sum(episode.decisions for episode in self.recent), 1)
+        losses = {name: _mean(part[name] for part in losses) for name in losses[0]}
         return dict(zip(COLUMNS, (
             self.frames, self.seconds / 60, speed, tau,
             _mean(episode.success for episode in self.recent),
@@ -208,49 +274,63 @@ class _Training:
             *(losses[name] for name in BASIC_LOSSES), middle - start, end - middle,
             *(losses.get(name, math.nan) for name in TASKS)), strict=True))
 
-    def save(self) -> None:
+    def save(self, log: Log | None) -> None:
         """Write the training state, then the checkpoint; each whole or not at all."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        if log is None:  # the leading process writes
+            return
+        log.sync()
+        with written(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if self.learner.replay is not None:
+                self.learner.replay.flush()
         write_state(self.folder / STATE, self._state_dict())
         save_checkpoint(self.folder / CHECKPOINT, self.network, {
             **self.info, 'frames': self.frames, 'minutes': round(self.seconds / 60, 2)})
 
-    def load(self) -> None:
-        """Go on from the last save.
+    def _load(self, state: dict) -> None:
+        """Go on from a save.
 
         Raises:
-            UserError: nothing to resume, a corrupt file, or another network, world or number of
-                environments.
+            UserError: of another network, world or number of environments.
         """
-        path = self.folder / STATE
-        if not path.is_file():
-            raise UserError('a training is resumed from its folder', str(path),
-                            'start it without resume, or name the folder of one')
-        state = read_state(path)
+        saved = {'kind of device': 'cpu', **state['identity']}
         for name, value in self._identity().items():
-            if state['identity'].get(name) != value:
-                raise UserError(f'a training is resumed with its own {name}: '
-                                f'{state["identity"].get(name)}', value,
+            if saved.get(name) != value:
+                raise UserError(f'a training is resumed with its own {name}: {saved.get(name)}',
+                                value,
                                 'resume it with the same options, or start a new one')
         self.network.load_state_dict(state['network'])
         self.learner.optimiser.load_state_dict(state['optimiser'])
         self.curriculum.load_state_dict(state['curriculum'])
-        self.generator.set_state(state['generator'])
         self.recent.extend(Episode(*episode) for episode in state['recent'])
         self.frames, self.updates = state['frames'], state['updates']
         self.seconds = state['seconds']
-        self.env.set_difficulty(self.curriculum.tau)
-        self.collector.load_state_dict(state['collector'])
-        if state['env'] is not None and hasattr(self.env, 'set_state'):
+        words = [f'resumed at {self.frames:,} frames']
+        if state['env'] is not None and self.processes.count == 1:
+            self.generator.set_state(state['generator'])
+            self.env.set_difficulty(self.curriculum.tau)
+            self.collector.load_state_dict(state['collector'])
             self.env.set_state({name: rows.numpy() for name, rows in state['env'].items()})
         else:
-            # Episodes never seen before: another seed for each resumption point.
-            self.collector.begin(self.config.seed + 1_000_003 * self.updates)
+            # No environment's first episode is an old one, wherever the counting begins.
+            count = self.env.num_envs * self.processes.count
+            self.curriculum.load_state_dict({
+                **state['curriculum'], 'first': [0] * count, 'finished': [False] * count})
+            self._begin(self.updates)
+            words.append('episodes begin anew')
+        replay = self.learner.replay
+        if replay is not None:
+            replay.load_state_dict(state.get('replay') or {'total': 0})
+            words.append(
+                f'the replay memory is mapped: {replay.count * replay.num_envs:,} steps are there'
+                if replay.resumed == 'mapped' else 'the replay memory is refilled from now on')
+        if self.processes.leads:
+            print('; '.join(words), flush=True)
         self.clock = time.monotonic()
 
     def _state_dict(self) -> dict:
-        env = None
-        if hasattr(self.env, 'get_state'):
+        env = None  # of many processes each has its own, which nobody saves
+        if hasattr(self.env, 'get_state') and self.processes.count == 1:
             env = {name: torch.from_numpy(np.array(rows))
                    for name, rows in self.env.get_state().items()}
         return {
@@ -263,6 +343,7 @@ class _Training:
             'recent': [tuple(episode) for episode in self.recent],
             'frames': self.frames, 'updates': self.updates, 'seconds': self.seconds,
             'env': env,
+            'replay': None if self.learner.replay is None else self.learner.replay.state_dict(),
         }
 
     def _identity(self) -> dict:
@@ -274,6 +355,7 @@ class _Training:
                         for key, value in network.items()},
             'world version': self.env.world_version,
             'number of environments': self.env.num_envs,
+            'kind of device': self.network.device.type,  # random numbers differ
         }
 
 
@@ -295,76 +377,3 @@ class _Signals:
     def __exit__(self, *_):
         for number, handler in self.before.items():
             signal.signal(number, handler)
-
-
-class _Log:
-    """Metrics to CSV, TensorBoard and the terminal."""
-
-    def __init__(self, folder: Path, config: TrainConfig, frames: int):
-        self.config = config
-        self.writer = self.bar = None
-        self.printed = -math.inf
-        if config.tensorboard:
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ImportError as error:
-                raise UserError('logging to TensorBoard needs the package tensorboard', str(error),
-                                'pip install "vn_nav[train]", or leave TensorBoard off') from error
-            self.writer = SummaryWriter(folder / TENSORBOARD)
-        folder.mkdir(parents=True, exist_ok=True)
-        _cut_after(folder / METRICS, frames)
-        self.file = open(folder / METRICS, 'a', newline='')
-        self.rows = csv.DictWriter(self.file, COLUMNS)
-        if self.file.tell() == 0:
-            self.rows.writeheader()
-
-    def __enter__(self) -> _Log:
-        if sys.stdout.isatty():
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-            self.bar = Progress(BarColumn(24), TextColumn('{task.percentage:>3.0f}%'),
-                                TimeElapsedColumn(), TextColumn('{task.description}'))
-            self.task = self.bar.add_task('collecting the first frames', total=1.0)
-            self.bar.start()
-        return self
-
-    def __exit__(self, *_):
-        if self.bar is not None:
-            self.bar.stop()
-        if self.writer is not None:
-            self.writer.close()
-        self.file.close()
-
-    def write(self, row: dict) -> None:
-        """One update's figures."""
-        self.rows.writerow({name: f'{value:.6g}' if isinstance(value, float) else value
-                            for name, value in row.items()})
-        self.file.flush()
-        if self.writer is not None:
-            for name in COLUMNS[1:]:
-                if math.isfinite(row[name]):
-                    self.writer.add_scalar(f'train/{name}', row[name], row['frames'])
-        share = row['frames'] / self.config.frames
-        if self.config.minutes is not None:
-            share = max(share, row['minutes'] / self.config.minutes)
-        line = (f'{row["frames"]:,} frames · {row["minutes"]:.1f} min · {row["fps"]:,.0f} fps · '
-                f'tau {row["tau"]:.2f} · success {row["success"]:.2f} · '
-                f'length {row["length"]:.0f} · collisions {row["collisions"]:.2f} · '
-                f'entropy {row["entropy"]:.2f} · kl {row["kl"]:.4f} · '
-                f'value {row["value_loss"]:.3f}')
-        if self.bar is not None:
-            self.bar.update(self.task, completed=share, description=line)
-        elif time.monotonic() - self.printed >= 10 or share >= 1:
-            print(f'{min(share, 1):4.0%} {line}', flush=True)
-            self.printed = time.monotonic()
-
-
-def _cut_after(path: Path, frames: int) -> None:
-    """Drop the rows of a metrics file that lie beyond a resumption point."""
-    if not path.exists():
-        return
-    if frames == 0:
-        path.unlink()
-        return
-    lines = path.read_text().splitlines(keepends=True)
-    kept = lines[:1] + [line for line in lines[1:] if int(line.split(',', 1)[0]) <= frames]
-    write_file(path, ''.join(kept).encode())

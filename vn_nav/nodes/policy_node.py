@@ -148,6 +148,7 @@ class PolicyNode(LifecycleNode):
         self.halt('deactivated')
         with self._wake:
             self.navigator.reset()
+            self._worker.tell_arrival()
         return super().on_deactivate(state)
 
     def on_cleanup(self, _state) -> TransitionCallbackReturn:

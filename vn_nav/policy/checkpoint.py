@@ -69,8 +69,8 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
         half: store weights in 16 bits, half the size.
 
     Raises:
-        UserError: a missing or unknown key of `info`, a value that JSON cannot hold, or a weight
-            that is not finite.
+        UserError: a missing or unknown key of `info`, a value that JSON cannot hold, a weight
+            that is not finite, or a full disk; the checkpoint before is whole.
     """
     folder = Path(folder)
     info = _check_info(info, 'the checkpoint to save')
@@ -97,7 +97,13 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
     parameters = sum(tensor.numel() for tensor in tensors.values())
     files = {WEIGHTS: weights, CONFIG: text.encode(),
              CARD: model_card(config, parameters, len(weights)).encode()}
-    _write_folder(folder, files)
+    try:
+        _write_folder(folder, files)
+    except OSError as error:
+        raise UserError(f'a checkpoint can be written ({len(weights) / 1e6:.1f} MB)',
+                        f'{error.filename or folder}: {error.strerror}',
+                        'free some space, or choose a folder that may be written: the checkpoint '
+                        'before is whole') from error
 
 
 def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None = None
@@ -230,6 +236,10 @@ def model_card(config: dict, parameters: int, size: int) -> str:
 
 def _describe(network: dict) -> str:
     """The network in words."""
+    if network['architecture'] == 'icra2017':
+        frozen = {'': 'the small random encoder', 'resnet50': 'ResNet-50'}[network['frozen']]
+        return (f'Zhu et al. 2017 on frozen features of {frozen}; {network["frames"]} stacked '
+                f'frames; layers for {network["scenes"]} scene{"s" * (network["scenes"] > 1)}')
     words = {'thesis': "the thesis's two streams", 'unreal': "UNREAL's single stream",
              'fused': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
                       f'goal fused in the first; {network["features"]} features'}[

@@ -137,8 +137,8 @@ class Fused(nn.Module):
         for block in self.stage2:
             x = block(x)
         x = F.relu(apply(self.conv3, x))
-        # Flattened as [channel, row, column], whatever the memory format.
-        return x, F.relu(apply(self.trunk, x.flatten(1)))
+        # Flattened as the maps lie in memory, [row, column, channel].
+        return x, F.relu(apply(self.trunk, x.permute(0, 2, 3, 1).flatten(1)))
 
 
 class ResidualBlock(nn.Module):

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vn_nav.policy.encoders import apply
+from vn_nav.policy.encoders import apply, uniform_by_fan_in
 
 
 class RecurrentState(NamedTuple):
     """Memory between calls: hidden and cell of the LSTM, [B,H] each.
 
     A policy on stacked frames keeps its last pictures in `hidden` ([B,K-1,3,S,S] uint8) instead,
-    and nothing in `cell` ([B,0]).
+    or their frozen features ([B,K-1,F] float32), and nothing in `cell` ([B,0]).
     """
 
     hidden: Tensor
@@ -28,7 +28,7 @@ def stack_frames(image: Tensor, starts: Tensor, before: Tensor) -> tuple[Tensor,
     An episode's first picture stands for those before it.
 
     Args:
-        image: [T,B,3,S,S]; starts: [T,B] bool.
+        image: [T,B,3,S,S], or any rows [T,B,C,...]; starts: [T,B] bool.
         before: [B,K-1,3,S,S], the pictures before the first row, oldest first.
 
     Returns:
@@ -36,6 +36,11 @@ def stack_frames(image: Tensor, starts: Tensor, before: Tensor) -> tuple[Tensor,
     """
     steps, batch = starts.shape
     kept = before.shape[1]
+    if steps == 1:  # a robot acts: no time to look up, and operations that ONNX knows
+        now = image[0].unsqueeze(1)
+        begun = starts[0].view(batch, *[1] * (before.dim() - 1))
+        rows = torch.cat([torch.where(begun, now, before), now], dim=1)
+        return rows.flatten(1, 2), rows[:, 1:]
     rows = torch.cat([before.transpose(0, 1), image])  # [K-1+T,B,...]
     time = torch.arange(steps, device=starts.device).unsqueeze(1)
     # The episode's first row; far in the past where it began before this call.
@@ -53,6 +58,7 @@ class Feedforward(nn.Module):
     def __init__(self, inputs: int, hidden: int):
         super().__init__()
         self.linear = nn.Linear(inputs, hidden)
+        uniform_by_fan_in(self)
 
     def forward(self, inputs: Tensor, starts: Tensor, state: RecurrentState
                 ) -> tuple[Tensor, RecurrentState]:
@@ -88,9 +94,21 @@ class MaskedLSTM(nn.Module):
         """Inputs [T,B,I], starts [T,B] bool -> outputs [T,B,H] float32 and the last memory."""
         gates = F.linear(inputs, self.input_weight.to(inputs.dtype)).float() + self.bias
         keep = (~starts).unsqueeze(-1).to(gates.dtype)
+        if torch.jit.is_tracing():  # for ONNX, which knows no autograd functions
+            return self._one_step(gates, keep, state)
         outputs, cell = _Recurrence.apply(gates, self.recurrent_weight, state.hidden, state.cell,
                                           keep, inputs.dtype)
         return outputs, RecurrentState(outputs[-1], cell)
+
+
+    def _one_step(self, gates: Tensor, keep: Tensor, state: RecurrentState
+                  ) -> tuple[Tensor, RecurrentState]:
+        """What `_Recurrence` computes for T = 1, in plain operations."""
+        gates = gates[0] + F.linear(state.hidden * keep[0], self.recurrent_weight)
+        i, f, o, g = gates.chunk(4, dim=1)
+        cell = torch.sigmoid(i) * torch.tanh(g) + torch.sigmoid(f) * (state.cell * keep[0])
+        hidden = torch.sigmoid(o) * torch.tanh(cell)
+        return hidden.unsqueeze(0), RecurrentState(hidden, cell)
 
 
 class _Recurrence(torch.autograd.Function):

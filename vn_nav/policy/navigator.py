@@ -83,6 +83,7 @@ class Navigator:
         self.dropped: dict[str, int] = {}  # frames by reason
         self._target = np.zeros(4)
         self._stopped_at = 0.0
+        self._idle_from: float | None = -np.inf  # steady time of leaving motion; None: just now
         self._healthy_since: float | None = None
         self._last_frame: float | None = None  # steady time of the newest good frame
         self._last_stamp = -np.inf
@@ -186,7 +187,7 @@ class Navigator:
         return '; '.join(f' (dropped {n}: {reason})' for reason, n in self.dropped.items())
 
     def disable(self) -> None:
-        """Stand still and fall silent; not latched."""
+        """Zero at once, repeated for `STOP_SECONDS`, then silence; not latched."""
         if self.state is not State.STOPPED:
             self._idle('disabled')
 
@@ -204,6 +205,8 @@ class Navigator:
 
     def _idle(self, reason: str) -> None:
         self._abandon()
+        if self.state not in (State.IDLE, State.STOPPED):
+            self._idle_from = None  # a command may be in force: the next step takes it back
         self.state, self.reason, self.arrival = State.IDLE, reason, None
 
     def _abandon(self) -> None:
@@ -290,7 +293,9 @@ class Navigator:
         if self.state is State.STOPPED:
             return np.zeros(4) if now - self._stopped_at < STOP_SECONDS else None
         if self.state is State.IDLE:
-            return None
+            if self._idle_from is None:
+                self._idle_from = now
+            return np.zeros(4) if now - self._idle_from < STOP_SECONDS else None
         self._watch(now, odometry_lost)
         if self.state is not State.RUNNING:
             return np.zeros(4)

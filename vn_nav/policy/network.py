@@ -25,12 +25,16 @@ from vn_nav.policy.heads import (
     grown,
 )
 from vn_nav.policy.memory import Feedforward, MaskedLSTM, RecurrentState, stack_frames
+from vn_nav.policy.zhu import FROZEN, SceneLinear, Siamese
 
-ARCHITECTURES = ('fused', 'thesis', 'unreal')
+ARCHITECTURES = ('fused', 'thesis', 'unreal', 'icra2017')
 # Channels that each image head draws, and the width of its inner maps. The thesis says that depth
 # has "only" 32, so the segmentation heads are wider.
 IMAGE_HEADS = {'depth': (1, 32), 'segmentation': (3, 64), 'goal_segmentation': (3, 64),
                'reconstruction': (3, 32)}
+# Pictures go through the encoder in parts of this size on a processor: larger float32 pixels are
+# mapped and unmapped by the allocator at every call, which costs a tenth of the whole training.
+CHUNK_BYTES = 2**24
 HEADS = ('pixel_control', 'reward_prediction', *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance')
 
 
@@ -40,7 +44,7 @@ class NetworkConfig:
 
     actions: tuple[str, ...]
     size: int = 84  # pixels a side
-    architecture: str = 'fused'  # of ARCHITECTURES, see `vn_nav.policy.encoders`
+    architecture: str = 'fused'  # of ARCHITECTURES, see `vn_nav.policy.encoders` and `zhu`
     channels: tuple[int, int, int] = (32, 64, 32)  # of the fused encoder
     blocks: int = 0  # residual blocks a stage of the fused encoder
     features: int = 256  # of the fused encoder's trunk
@@ -53,6 +57,9 @@ class NetworkConfig:
     # whole mean stay exact in bfloat16.
     pixel_mean: float = 120.0
     pixel_std: float = 36.0
+    # Of icra2017 alone.
+    frozen: str = ''  # encoder, of `vn_nav.policy.zhu.FROZEN`
+    scenes: int = 1  # that have layers of their own
 
     def __post_init__(self):
         for name in ('actions', 'channels', 'heads'):
@@ -77,6 +84,14 @@ class NetworkConfig:
             (not self.pose_to_memory or 'goal_pose' in self.heads,
              'pose_to_memory needs the head goal_pose', self.heads),
             (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
+            (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
+             'one', self.frozen),
+            (self.scenes >= 1, 'there is at least one scene', self.scenes),
+            (self.architecture == 'icra2017' or (not self.frozen and self.scenes == 1),
+             'a frozen encoder and layers of scenes belong to the architecture icra2017',
+             self.architecture),
+            (self.architecture != 'icra2017' or not self.heads,
+             'the architecture icra2017 has no heads beside actor and critic', self.heads),
         )
         for kept, rule, received in rules:
             if not kept:
@@ -98,6 +113,7 @@ class Latents(NamedTuple):
     features: Tensor  # [T*B,F]
     hidden: Tensor  # [T,B,H] float32 outputs of the memory
     pose: Pose | None  # [T*B,...], if the network has the head goal_pose
+    scene: Tensor | None = None  # [T,B] int64, of icra2017
 
 
 class Policy(nn.Module):
@@ -108,13 +124,16 @@ class Policy(nn.Module):
             outputs are float32 in any case.
         heads: the auxiliary heads by name.
         target_side: side of the maps that pixel control and image heads draw.
-        cell: pixels of the picture under one cell of these maps.
+        cell: pixels of the picture under one cell of these maps; both 0 where there are none.
     """
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
         self.config = config
         self.compute_dtype = torch.float32
+        if config.architecture == 'icra2017':
+            self._build_scenes()
+            return
         pixels = {'mean': config.pixel_mean, 'std': config.pixel_std, 'frames': config.frames}
         if config.architecture == 'fused':
             self.encoder = Fused(config.size, config.channels, config.features, config.blocks,
@@ -137,6 +156,16 @@ class Policy(nn.Module):
         self.cell = max(config.size // self.target_side, 1)
         self.heads = nn.ModuleDict({name: self._head(name, channels, side)
                                     for name in config.heads})
+
+    def _build_scenes(self) -> None:
+        """The parts of icra2017, see `vn_nav.policy.zhu`."""
+        config, width = self.config, self.config.hidden
+        self.encoder = Siamese(config.frozen, config.frames, width)
+        self.memory = SceneLinear(width, width, config.scenes)
+        self.actor = SceneLinear(width, len(config.actions), config.scenes)
+        self.critic = SceneLinear(width, 1, config.scenes)
+        self.heads = nn.ModuleDict()
+        self.target_side = self.cell = 0
 
     def _initialise(self, thesis: bool) -> None:
         for layer, gain in ((self.actor, 0.01), (self.critic, 1.0)):
@@ -165,14 +194,35 @@ class Policy(nn.Module):
         config = self.config
         if config.frames > 1:
             before = torch.zeros(batch, config.frames - 1, 3, config.size, config.size,
-                                 dtype=torch.uint8)
-            return RecurrentState(before, torch.zeros(batch, 0))
-        zeros = torch.zeros(batch, config.hidden)
+                                 dtype=torch.uint8, device=self.device)
+            if self.frozen:
+                before = torch.zeros(batch, config.frames - 1, self.encoder.frozen.features,
+                                     device=self.device)
+            return RecurrentState(before, torch.zeros(batch, 0, device=self.device))
+        zeros = torch.zeros(batch, config.hidden, device=self.device)
         return RecurrentState(zeros, zeros.clone())
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+    @property
+    def frozen(self) -> bool:
+        """Whether pictures pass an encoder that learns nothing before anything else."""
+        return self.config.architecture == 'icra2017'
+
+    def look(self, pictures: Tensor) -> Tensor:
+        """Frozen features [...,F] of pictures [...,3,S,S], to pass in place of them.
+
+        Goals take them in `Observation.goals`, pictures in `Observation.extras['features']`: what
+        never changes is then computed once.
+        """
+        return self.encoder.look(pictures)
 
     def encode_goals(self, goals: Tensor) -> Tensor:
         """What the encoder keeps of goals [G,3,S,S] uint8; see `vn_nav.policy.encoders`."""
-        if self.config.frames > 1:
+        if self.config.frames > 1 and not self.frozen:
             goals = goals.repeat(1, self.config.frames, 1, 1)
         return self.encoder.encode_goals(goals, self.compute_dtype)
 
@@ -182,7 +232,17 @@ class Policy(nn.Module):
 
         Without an index goal n belongs to picture n.
         """
-        return self.encoder(image, goal_maps, goal_index, self.compute_dtype)
+        count = len(image)
+        if self.compute_dtype == torch.float32 and image.device.type == 'cpu':
+            count = max(CHUNK_BYTES // (4 * image[0].numel()), 1)
+        parts = [slice(first, first + count) for first in range(0, len(image), count)]
+        if len(parts) == 1:
+            return self.encoder(image, goal_maps, goal_index, self.compute_dtype)
+        done = [self.encoder(image[part], goal_maps if goal_index is not None else goal_maps[part],
+                             None if goal_index is None else goal_index[part],
+                             self.compute_dtype) for part in parts]
+        maps, features = zip(*done, strict=True)
+        return torch.cat(maps), torch.cat(features)
 
     def latents(self, obs: Observation, starts: Tensor, state: RecurrentState | None = None,
                 goal_maps: Tensor | None = None) -> tuple[Latents, RecurrentState]:
@@ -191,6 +251,10 @@ class Policy(nn.Module):
         if state is None:
             state = self.initial_state(batch)
         maps, features, state = self._look(obs, starts, state, goal_maps)
+        if self.frozen:
+            scene = self._scene(obs)
+            own = self.memory(features.view(steps, batch, -1), scene)
+            return Latents(maps, features, torch.relu(own).float(), None, scene), state
         # One-hot of the last action; all zeros (not a class) for -1, an episode's start.
         actions = torch.arange(len(self.config.actions), device=features.device)
         dtype = features.dtype
@@ -207,7 +271,7 @@ class Policy(nn.Module):
 
     def maps(self, obs: Observation) -> Tensor:
         """The encoder's last maps [T*B,C,h,w] of T consecutive steps of an episode each."""
-        starts = torch.zeros(obs.last_action.shape, dtype=torch.bool)
+        starts = torch.zeros_like(obs.last_action, dtype=torch.bool)
         starts[0] = True
         return self._look(obs, starts, self.initial_state(starts.shape[1]), None)[0]
 
@@ -215,16 +279,34 @@ class Policy(nn.Module):
               goal_maps: Tensor | None) -> tuple[Tensor, Tensor, RecurrentState]:
         if goal_maps is None:
             goal_maps = self.encode_goals(obs.goals)
-        image = obs.image.flatten(0, 1)
+        frames = obs.image
+        if self.frozen:
+            known = (obs.extras or {}).get('features')
+            frames = self.look(obs.image) if known is None else known
         if self.config.frames > 1:
-            image, before = stack_frames(obs.image, starts, state.hidden)
+            image, before = stack_frames(frames, starts, state.hidden)
             state = RecurrentState(before, state.cell)
+        else:
+            image = frames.flatten(0, 1)
         index = None if obs.goal_index is None else obs.goal_index.flatten()
         return *self.encode(image, goal_maps, index), state
+
+    def _scene(self, obs: Observation) -> Tensor:
+        """[T,B] whose layers see the observations."""
+        if self.config.scenes == 1:
+            return torch.zeros_like(obs.last_action)
+        if 'scene' not in (obs.extras or {}):
+            raise UserError('a network with layers for several scenes is told the scene',
+                            "observations without extras['scene']", 'pass it, or train and use '
+                            'a network of one scene')
+        return obs.extras['scene']
 
     def read(self, latents: Latents) -> PolicyOutput:
         """Actor, critic and arrival from latents."""
         hidden = latents.hidden
+        if self.frozen:
+            return PolicyOutput(self.actor(hidden, latents.scene),
+                                self.critic(hidden, latents.scene).squeeze(-1))
         arrival = self.heads['arrival'](hidden) if 'arrival' in self.heads else None
         return PolicyOutput(self.actor(hidden), self.critic(hidden).squeeze(-1), arrival)
 

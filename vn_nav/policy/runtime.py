@@ -13,6 +13,7 @@ from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import DECODINGS, load_checkpoint
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
+from vn_nav.policy.zhu import check_scenes
 
 
 def choose(logits: torch.Tensor, decoding: str, generator: torch.Generator) -> torch.Tensor:
@@ -151,8 +152,8 @@ class BatchedPolicy:
         self._goal_maps = GoalMaps(network)
 
     @torch.inference_mode()
-    def act(self, obs: dict[str, np.ndarray], goals: np.ndarray, reset_mask: np.ndarray
-            ) -> np.ndarray:
+    def act(self, obs: dict[str, np.ndarray], goals: np.ndarray, reset_mask: np.ndarray,
+            scene: np.ndarray | None = None) -> np.ndarray:
         """Actions [N] int64.
 
         Args:
@@ -160,10 +161,15 @@ class BatchedPolicy:
             goals: [G,3,S,S] uint8; encoded again only when another array is passed, so do not
                 write into one.
             reset_mask: [N] bool, where an episode begins with this observation.
+            scene: [N] number of each robot's scene; only for a network with several.
 
         Raises:
             FloatingPointError: the logits are not finite.
+            UserError: a scene that the network does not know, or none where it needs one.
         """
+        extras, scenes = None, self.network.config.scenes
+        if scenes > 1 and scene is not None:
+            extras = {'scene': torch.from_numpy(check_scenes(scene, scenes))[None]}
         if goals is not self._goals:
             self._goals, self._goal_maps = goals, GoalMaps(self.network)
         maps = self._goal_maps.of(torch.from_numpy(goals),
@@ -171,7 +177,7 @@ class BatchedPolicy:
         observation = Observation(
             torch.from_numpy(obs['image'])[None], None, None,
             *(torch.from_numpy(np.asarray(obs[name]))[None]
-              for name in ('last_action', 'last_reward')))
+              for name in ('last_action', 'last_reward')), extras)
         starts = torch.from_numpy(np.asarray(reset_mask, bool))[None]
         output, self._state = self.network(observation, starts, self._state, maps)
         if output.arrival is not None:

@@ -1,0 +1,108 @@
+"""The table of presets: how fast each learns one task, several seeds, two runs side by side.
+
+    python bench/learning.py                          # all runs: about six hours on two cores
+    python bench/learning.py --presets fast --seeds 0 # some of them
+
+A house of two rooms (one room is half solved at random), 84 x 84, 300 decisions at most, one
+thread a run. Every run is limited by its wall-clock time, and its schedules end with it. A run
+that was interrupted goes on; one that has ended is not repeated. Curves go to docs/curves/table/,
+thinned; `vn_nav compare` makes the table and the figure from them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+CURVES = ROOT / 'docs' / 'curves' / 'table'
+MINUTES = {'a2c': 30, 'unreal': 90, 'thesis': 90, 'fast': 30}
+HOUSE, ROOMS = 3, 2
+ROWS = 400  # kept of a curve
+
+
+def command(preset: str, seed: int, folder: Path, minutes: float) -> list[str]:
+    """The training of one cell of the table."""
+    words = [sys.executable, '-m', 'vn_nav.cli', 'train', '--preset', preset,
+             '--house', str(HOUSE), '--rooms', str(ROOMS), '--seed', str(seed),
+             '--minutes', str(minutes), '--frames', '1e9', '--max-decisions', '300',
+             '--no-tensorboard', '--out', str(folder)]
+    return words + (['--resume'] if folder.exists() else [])
+
+
+def is_over(folder: Path, minutes: float) -> bool:
+    """Whether a run has used its time."""
+    rows = read(folder)
+    return bool(rows) and float(rows[-1]['minutes']) >= 0.999 * minutes
+
+
+def read(folder: Path) -> list[dict]:
+    """The rows of a run's metrics."""
+    path = folder / 'metrics.csv'
+    if not path.exists():
+        return []
+    with open(path, newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def keep_curve(folder: Path) -> None:
+    """Write a run's curve where it is versioned, with at most `ROWS` rows."""
+    rows = read(folder)
+    every = max(1, -(-len(rows) // ROWS))
+    thinned = rows[::-every][::-1]  # the last row is among them
+    target = CURVES / folder.name / 'metrics.csv'
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with open(target, 'w', newline='') as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(thinned)
+
+
+def main():
+    """Run what is missing, two at a time, each pinned to a core of its own."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--presets', nargs='+', choices=tuple(MINUTES), default=list(MINUTES))
+    parser.add_argument('--seeds', type=int, nargs='+', default=[0, 1, 2])
+    parser.add_argument('--minutes', type=float, help='instead of the usual limits, to try it')
+    parser.add_argument('--runs', type=Path, default=ROOT / 'runs' / 'table')
+    arguments = parser.parse_args()
+    waiting = [(preset, seed) for seed in arguments.seeds for preset in arguments.presets]
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    running: dict[int, tuple[subprocess.Popen, Path]] = {}
+    arguments.runs.mkdir(parents=True, exist_ok=True)
+    while waiting or running:
+        for core in cores:
+            if core in running:
+                process, folder = running[core]
+                if process.poll() is None:
+                    continue
+                del running[core]
+                if process.returncode:
+                    raise SystemExit(f'{folder.name} ended with {process.returncode}: see its log')
+                keep_curve(folder)
+            if waiting:
+                preset, seed = waiting.pop(0)
+                folder = arguments.runs / f'{preset}-seed{seed}'
+                minutes = arguments.minutes or MINUTES[preset]
+                if is_over(folder, minutes):
+                    keep_curve(folder)
+                    continue
+                print(f'core {core}: {folder.name}, {minutes:g} minutes', flush=True)
+                with open(arguments.runs / f'{folder.name}.log', 'a') as log:
+                    running[core] = subprocess.Popen(
+                        ['taskset', '-c', str(core), *command(preset, seed, folder, minutes)],
+                        stdout=log, stderr=subprocess.STDOUT, cwd=ROOT,
+                        env=os.environ | {'OMP_NUM_THREADS': '1'}), folder
+        time.sleep(2)
+    subprocess.run([sys.executable, '-m', 'vn_nav.cli', 'compare',
+                    *map(str, sorted(CURVES.iterdir())), '--out', str(CURVES / 'table.html'),
+                    '--json', str(CURVES / 'table.json')], check=True, cwd=ROOT)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,110 @@
+"""Checkpoints: whole, verified, and the runtime that reads them."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from vn_nav.errors import UserError
+from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
+from vn_nav.policy.network import HEADS, NetworkConfig, Policy
+from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime
+from vn_nav.robot import DRIVE_ACTIONS
+
+SMALL = NetworkConfig(actions=DRIVE_ACTIONS, size=36, channels=(8, 8, 8), features=24, hidden=16)
+FACTS = {'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+def pictures(count, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (count, 3, 36, 36), dtype=np.uint8)
+
+
+def observed(images, last_action):
+    """A batch as an environment gives it; every robot has goal 0."""
+    n = len(images)
+    return {'image': images, 'goal_index': np.zeros(n, np.int64),
+            'last_action': np.full(n, last_action), 'last_reward': np.zeros(n, np.float32)}
+
+
+@pytest.mark.parametrize('changes', [
+    {}, {'architecture': 'thesis', 'heads': HEADS, 'deconvolutions': 2},
+    {'architecture': 'unreal', 'frames': 4}, {'blocks': 1, 'heads': ('goal_pose',),
+                                              'pose_to_memory': True}])
+def test_checkpoints_come_back(tmp_path, changes):
+    network = Policy(dataclasses.replace(SMALL, **changes))
+    save_checkpoint(tmp_path / 'model', network, FACTS)
+    loaded = load_checkpoint(tmp_path / 'model', DRIVE_ACTIONS)
+    assert loaded.config == network.config and loaded.info['world_version'] == '1'
+    state = loaded.network.state_dict()
+    assert list(state) == list(network.state_dict())
+    assert all(torch.equal(tensor, state[name]) for name, tensor in network.state_dict().items())
+    assert sorted(path.name for path in (tmp_path / 'model').iterdir()) == [
+        'README.md', 'config.json', 'model.safetensors']
+
+
+def test_damage_is_refused(tmp_path):
+    folder = tmp_path / 'model'
+    save_checkpoint(folder, Policy(SMALL), FACTS)
+    with pytest.raises(UserError, match='checkpoint'):
+        load_checkpoint(tmp_path / 'nothing')
+    weights = folder / 'model.safetensors'
+    sound = weights.read_bytes()
+    for at in np.random.default_rng(0).integers(0, len(sound), 25):
+        flipped = bytearray(sound)
+        flipped[at] ^= 1
+        weights.write_bytes(flipped)
+        with pytest.raises(UserError, match='SHA-256'):
+            load_checkpoint(folder)
+    weights.write_bytes(sound)
+    config = json.loads((folder / 'config.json').read_text())
+    config['network']['hidden'] = 99
+    (folder / 'config.json').write_text(json.dumps(config))
+    with pytest.raises(UserError, match='fits'):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize('actions', [
+    ('forward', 'rotate_left'), tuple(reversed(DRIVE_ACTIONS)),
+    (DRIVE_ACTIONS[1], DRIVE_ACTIONS[0], *DRIVE_ACTIONS[2:])])
+def test_other_actions_or_another_order_are_refused(tmp_path, actions):
+    """Trap 8: names and order are in the checkpoint, and checked."""
+    save_checkpoint(tmp_path / 'model', Policy(SMALL), FACTS)
+    stored = json.loads((tmp_path / 'model' / 'config.json').read_text())['action_names']
+    assert tuple(stored) == DRIVE_ACTIONS
+    with pytest.raises(UserError, match='in that order'):
+        load_checkpoint(tmp_path / 'model', actions)
+
+
+@pytest.mark.parametrize('frames', [1, 3])
+def test_runtime_and_batched_policy_agree(tmp_path, frames):
+    save_checkpoint(tmp_path / 'model', Policy(dataclasses.replace(SMALL, frames=frames)), FACTS)
+    runtime = PolicyRuntime(tmp_path / 'model', decoding='greedy')
+    goals = pictures(1, seed=1)
+    runtime.set_goal(goals[0])
+    policy = BatchedPolicy(load_checkpoint(tmp_path / 'model').network, 1, 'greedy')
+    last = -1
+    for t, image in enumerate(pictures(5)):
+        action = runtime.act(image)
+        same = policy.act(observed(image[None], last), goals, np.array([t == 0]))
+        assert action == same[0]
+        last = action
+    with pytest.raises(UserError, match='picture'):
+        runtime.act(np.zeros((3, 20, 20), np.uint8))
+
+
+def test_not_finite_output_is_an_error():
+    network = Policy(SMALL)
+    with torch.no_grad():
+        network.actor.bias[0] = math.nan
+    policy = BatchedPolicy(network, 1)
+    with pytest.raises(FloatingPointError, match='finite'):
+        policy.act(observed(pictures(1), -1), pictures(2), np.array([True]))
