@@ -240,7 +240,7 @@ def test_schedules_are_linear():
 
 @pytest.mark.parametrize('size', [36, 128])
 def test_the_total_gradient_is_the_weighted_sum(size):
-    """Of the thesis's nine losses, each task on a draw of its own (thesis, 5.3 and table 5.1)."""
+    """Of the thesis's nine losses, each on a draw of its own (thesis, 5.3 and table 5.1)."""
     config = preset('thesis', hidden=32, replay_steps=240, replay_length=8, replay_batch=5)
     network = network_of(config, size)
     rollout = collected(network, rollouts=2)
@@ -271,8 +271,10 @@ def test_the_total_gradient_is_the_weighted_sum(size):
     parts['value_replay'] = auxiliary.value_replay_loss(plain, *window(), gamma=0.99)
     seen, label = twin.reward_frames(5, draws)
     parts['reward_prediction'] = auxiliary.reward_prediction_loss(plain, plain.maps(seen), label)
+    latents, drawn = window()  # the image heads share one draw
+    maps = latents.maps[:drawn.valid.numel()]
     for name in ('depth', 'segmentation', 'goal_segmentation'):
-        parts[name] = auxiliary.image_loss(plain, name, *window())
+        parts[name] = auxiliary.image_loss(plain, name, maps, drawn)
     weights = {'actor': 1.0, 'critic': 0.5, 'entropy': -0.001, 'value_replay': 1.0,
                'pixel_control': 0.05, 'reward_prediction': 1.0, 'depth': 0.1,
                'segmentation': 0.1, 'goal_segmentation': 0.1}

@@ -22,6 +22,7 @@ from vn_nav.learning.pixel_change import (
 )
 from vn_nav.learning.returns import masked_mean, n_step_q, n_step_returns
 from vn_nav.learning.rollout import Rollout
+from vn_nav.policy.heads import NEAR
 from vn_nav.policy.network import Latents, Policy
 
 MAX_DEPTH = 10.0  # m, white in the depth target
@@ -30,20 +31,24 @@ POSE_OVERLAP = 0.1  # share of the goal picture that must be in view for its pos
 CLASS_COUNT = 64  # colours; label ids are below
 
 
-def image_target(network: Policy, name: str, rollout: Rollout) -> Tensor:
-    """What an image head shall draw: [(T+1)*B,c,k,k] float32 in [0, 1] (thesis, 4.4).
+def image_target(network: Policy, name: str, shown: Tensor) -> Tensor:
+    """What an image head shall draw: [N,c,k,k] float32 in [0, 1] (thesis, 4.4).
 
     Class ids become colours first and are averaged then: ids are never interpolated.
+
+    Args:
+        network: with the head.
+        name: of the head.
+        shown: [N,3,S,S] uint8 pictures (reconstruction), [N,S,S] depth, as float m or as uint8
+            with 255 at `MAX_DEPTH`, or [N,S,S] uint8 class ids.
     """
     if name == 'reconstruction':
-        picture = rollout.observation.image.flatten(0, 1).float() / 255
+        picture = shown.float() / 255
     elif name == 'depth':
-        depth = _privileged(rollout, 'depth').flatten(0, 1)
-        scaled = depth.float() / 255 if depth.dtype == torch.uint8 else depth / MAX_DEPTH
+        scaled = shown.float() / 255 if shown.dtype == torch.uint8 else shown / MAX_DEPTH
         picture = scaled.clamp(0, 1).unsqueeze(1)
     else:
-        labels = _privileged(rollout, name).flatten(0, 1)
-        return label_target(labels, _colours(labels.device), network.target_side, network.cell)
+        return label_target(shown, _colours(shown.device), network.target_side, network.cell)
     return average_pool_target(picture, network.target_side, network.cell)
 
 
@@ -52,11 +57,15 @@ def _colours(device: torch.device) -> Tensor:
     return label_colours(CLASS_COUNT).to(device)
 
 
-def image_loss(network: Policy, name: str, latents: Latents, rollout: Rollout) -> Tensor:
-    """Mean squared error of depth, a segmentation or the reconstructed input (thesis, 4.4)."""
-    rows = rollout.valid.numel()
-    drawn = network.heads[name](latents.maps[:rows])
-    error = ((drawn - image_target(network, name, rollout)[:rows]) ** 2).mean(dim=(1, 2, 3))
+def image_loss(network: Policy, name: str, maps: Tensor, rollout: Rollout) -> Tensor:
+    """Mean squared error of depth, a segmentation or the reconstructed input (thesis, 4.4).
+
+    `maps` are the encoder's last ones of the first T rows.
+    """
+    shown = (rollout.observation.image if name == 'reconstruction'
+             else _privileged(rollout, name))[:len(rollout.valid)]
+    target = image_target(network, name, shown.flatten(0, 1))
+    error = ((network.heads[name](maps) - target) ** 2).mean(dim=(1, 2, 3))
     return masked_mean(error.view(rollout.valid.shape), rollout.valid)
 
 
@@ -111,17 +120,25 @@ def pose_loss(position: Tensor, heading: Tensor, overlap_logit: Tensor, goal_pos
               overlap: Tensor, valid: Tensor) -> Tensor:
     """Loss of a relative pose: Huber on position and heading, cross-entropy on the overlap.
 
+    Positions are compared after `_shrink`: a metre counts for less where the goal is far.
+
     Args:
         position: [N,2] m; heading: [N,2] cos, sin; overlap_logit: [N]: see `heads.Pose`.
         goal_pose: [N,4] x, y [m], cos, sin; overlap: [N] share of the goal picture in view.
         valid: [N] bool.
     """
     sees = (overlap >= POSE_OVERLAP)
-    error = (F.smooth_l1_loss(position, goal_pose[:, :2], reduction='none').sum(1)
+    error = (F.smooth_l1_loss(_shrink(position), _shrink(goal_pose[:, :2]),
+                              reduction='none').sum(1)
              + 2 * F.smooth_l1_loss(heading, goal_pose[:, 2:], reduction='none').sum(1))
     seen = masked_mean(error, valid & sees)
     overlaps = F.binary_cross_entropy_with_logits(overlap_logit, sees.float(), reduction='none')
     return seen + masked_mean(overlaps, valid)
+
+
+def _shrink(position: Tensor) -> Tensor:
+    """Positions [N,2] m with their distance d shortened to d / (1 + d / `NEAR`)."""
+    return position / (1 + position.norm(dim=1, keepdim=True) / NEAR)
 
 
 def arrival_loss(network: Policy, latents: Latents, rollout: Rollout) -> Tensor:

@@ -67,6 +67,10 @@ class LearnerConfig:
     arrival: float = 0.0
     distance: float = 0.0
     imitation: float = 0.0  # at the start
+    # Whole episodes are driven by the teacher, so that the policy is shown where it should be: a
+    # share of them at the start, falling to none.
+    teacher_share: float = 0.0
+    teacher_until: float = 0.5  # share of the training at which it has fallen to 0
     imitation_until: float = 0.7  # share of the training at which it has fallen to 0
     # Whom to imitate: one that knows what the robot has seen, or the shortest path, which only a
     # policy that knows the house by heart can follow.
@@ -83,20 +87,25 @@ class LearnerConfig:
     def __post_init__(self):
         positive = ('learning_rate', 'final_learning_rate', 'max_gradient_norm', 'epochs',
                     'minibatches', 'replay_steps', 'replay_batch', 'replay_length',
-                    'rmsprop_epsilon')
+                    'rmsprop_epsilon', 'imitation_until', 'teacher_until')
         for name in positive:
             value = getattr(self, name)
             if not value > 0 and not (name == 'final_learning_rate' and value == 0):
                 raise UserError(f'{name} is positive', value, 'correct it')
         if self.clip is not None and not self.clip > 0:
             raise UserError('clip is positive, or None', self.clip, 'correct it')
-        for name in ('gamma', 'lam', 'pixel_control_gamma', 'unrewarded', 'imitation_until'):
+        for name in ('gamma', 'lam', 'pixel_control_gamma', 'unrewarded', 'imitation_until',
+                     'teacher_share', 'teacher_until'):
             if not 0 <= getattr(self, name) <= 1:
                 raise UserError(f'{name} lies in [0, 1]', getattr(self, name), 'correct it')
         for name in TASKS:
             if not getattr(self, name) >= 0:
                 raise UserError(f'the weight {name} is not negative', getattr(self, name),
                                 'correct it')
+        if self.teacher_share and not self.imitation:
+            raise UserError('a teacher drives episodes for the task imitation',
+                            f'teacher_share {self.teacher_share:g} with imitation 0',
+                            'set teacher_share to 0, or give imitation a weight')
         if self.teacher not in TEACHERS:
             raise UserError(f'the teacher is one of {", ".join(TEACHERS)}', self.teacher,
                             'choose one')
@@ -206,7 +215,7 @@ class Learner:
                                            gamma=config.gamma, lam=config.lam)
         target = advantage + rollout.value[:-1]
         if config.normalise_advantage:
-            advantage = self.processes.normalise(advantage, rollout.valid)
+            advantage = self.processes.normalise(advantage, own_frames(rollout))
         names = (*BASIC_LOSSES, *config.tasks)
         totals, updates = torch.zeros(len(names), device=rollout.action.device), 0
         environments = rollout.action.shape[1]
@@ -247,7 +256,7 @@ class Learner:
     def _loss(self, batch: Rollout, advantage: Tensor, target: Tensor,
               entropy_coefficient: float) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted sum of all losses, and by name what there is to say of them."""
-        config, valid = self.config, batch.valid
+        config, valid = self.config, own_frames(batch)
         latents, _ = self.network.latents(_rows(batch.observation), batch.starts[:-1], batch.state)
         output = self.network.read(latents)
         log_all = torch.log_softmax(output.logits, dim=-1)
@@ -265,10 +274,12 @@ class Learner:
                 - entropy_coefficient * entropy)
         extra = {}
         for name in config.tasks:
-            if name in config.from_replay:
-                extra[name] = self._replayed_loss(name)
-            else:
+            if name not in config.from_replay:
                 extra[name] = self._rollout_loss(name, latents, batch)
+            elif name not in IMAGE_HEADS:
+                extra[name] = self._replayed_loss(name)
+        extra |= self._replayed_image_losses()
+        for name in config.tasks:
             loss = loss + self._weights[name] * extra[name]
         with torch.no_grad():
             kl = masked_mean(ratio - 1 - log_ratio, valid)  # never negative
@@ -281,7 +292,7 @@ class Learner:
     def _rollout_loss(self, name: str, latents, batch: Rollout) -> Tensor:
         """Loss of a task on the batch of the policy itself."""
         if name in IMAGE_HEADS:
-            return auxiliary.image_loss(self.network, name, latents, batch)
+            return auxiliary.image_loss(self.network, name, latents.maps, batch)
         if name == 'goal_pose':
             return auxiliary.goal_pose_loss(latents, batch)
         if name == 'imitation':
@@ -289,6 +300,17 @@ class Learner:
                                             f'{self.config.teacher}_action')
         loss = {'arrival': auxiliary.arrival_loss, 'distance': auxiliary.distance_loss}[name]
         return loss(self.network, latents, batch)
+
+    def _replayed_image_losses(self) -> dict[str, Tensor]:
+        """Losses of the image heads on one draw; they need no memory, only maps."""
+        config, network = self.config, self.network
+        names = [name for name in config.from_replay if name in IMAGE_HEADS]
+        if not names:
+            return {}
+        window = self.replay.windows(config.replay_batch, config.replay_length, self.generator)
+        self._drawn |= dict.fromkeys(names, window)
+        maps = network.maps(_rows(window.observation), window.starts[:-1])
+        return {name: auxiliary.image_loss(network, name, maps, window) for name in names}
 
     def _replayed_loss(self, name: str) -> Tensor:
         """Loss of a task on a draw of its own from the replay memory."""
@@ -300,9 +322,6 @@ class Learner:
             return auxiliary.reward_prediction_loss(network, network.maps(seen), label)
         window = self.replay.windows(config.replay_batch, config.replay_length, self.generator)
         self._drawn[name] = window
-        if name in IMAGE_HEADS:
-            latents = network.latents(_rows(window.observation), window.starts[:-1])[0]
-            return auxiliary.image_loss(network, name, latents, window)
         latents = network.latents(window.observation, window.starts)[0]
         if name == 'value_replay':
             return auxiliary.value_replay_loss(
@@ -374,6 +393,7 @@ def select(rollout: Rollout, columns: Tensor, few_goals: bool = True) -> Rollout
         state=(None if rollout.state is None
                else RecurrentState(*(rows[columns] for rows in rollout.state))),
         privileged={key: part(rows) for key, rows in rollout.privileged.items()},
+        driven=part(rollout.driven),
         log_probability=part(rollout.log_probability), value=part(rollout.value))
 
 
@@ -381,6 +401,11 @@ def _few_goals(observation: Observation) -> Observation:
     """With only the goals that occur in it."""
     used, index = torch.unique(observation.goal_index, return_inverse=True)
     return observation._replace(goals=observation.goals[used], goal_index=index)
+
+
+def own_frames(rollout: Rollout) -> Tensor:
+    """[T,B] frames in which the policy itself acted."""
+    return rollout.valid if rollout.driven is None else rollout.valid & ~rollout.driven
 
 
 def _rows(observation: Observation) -> Observation:

@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from vn_nav.errors import UserError
-from vn_nav.learning.auxiliary import POSE_OVERLAP, pose_loss
+from vn_nav.learning.auxiliary import POSE_OVERLAP, image_target, pose_loss
 from vn_nav.learning.state_file import read_state, write_state
 from vn_nav.policy.heads import Pose
-from vn_nav.policy.network import Policy
+from vn_nav.policy.network import IMAGE_HEADS, Policy
 
 STATE, METRICS = 'pairs_state', 'pairs.csv'
 COLUMNS = ('pairs', 'minutes', 'loss', 'bearing_deg', 'bearing_within_30', 'heading_deg',
@@ -48,6 +48,7 @@ class PairConfig:
     batch: int = 128
     learning_rate: float = 1e-3  # at the start; falls linearly to a twentieth
     report_every: int = 200  # steps
+    image_weight: float = 0.5  # of the image heads, where the network has some
     save_seconds: float = 30.0
 
     def __post_init__(self):
@@ -59,7 +60,9 @@ class PairConfig:
 
 def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, folder: Path,
                    config: PairConfig, on_report: Callable[[dict], None] | None = None) -> None:
-    """Train a network's encoder and its head `goal_pose`; goes on where it was interrupted.
+    """Train a network's encoder, its head `goal_pose` and its image heads.
+
+    Goes on where it was interrupted.
 
     Args:
         network: changed in place.
@@ -68,7 +71,9 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
         config: numbers.
         on_report: called with each row of the metrics.
     """
-    parameters = [*network.encoder.parameters(), *network.heads['goal_pose'].parameters()]
+    drawn = [name for name in network.heads if name in IMAGE_HEADS]
+    parameters = [*network.encoder.parameters(),
+                  *(p for name in ('goal_pose', *drawn) for p in network.heads[name].parameters())]
     optimiser = torch.optim.Adam(parameters, config.learning_rate)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / STATE
@@ -83,9 +88,13 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
         for group in optimiser.param_groups:
             group['lr'] = config.learning_rate * (1 - 0.95 * share)
         pairs = source.draw(config.batch)
-        pose = _look(network, pairs)
+        pose, maps = _look(network, pairs)
         loss = pose_loss(*pose, torch.from_numpy(pairs['goal_pose']),
                          torch.from_numpy(pairs['overlap']), torch.ones(config.batch) > 0)
+        for name in drawn:
+            shown = torch.from_numpy(pairs['image' if name == 'reconstruction' else name])
+            error = network.heads[name](maps) - image_target(network, name, shown)
+            loss = loss + config.image_weight * (error ** 2).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
@@ -115,7 +124,7 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
 @torch.no_grad()
 def measure(network: Policy, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     """`errors` of a network on some pairs."""
-    poses = [_look(network, {name: rows[k:k + 128] for name, rows in pairs.items()})
+    poses = [_look(network, {name: rows[k:k + 128] for name, rows in pairs.items()})[0]
              for k in range(0, len(pairs['image']), 128)]
     return errors(Pose(*(torch.cat(parts) for parts in zip(*poses, strict=True))), pairs)
 
@@ -137,10 +146,10 @@ def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     }
 
 
-def _look(network: Policy, pairs: dict[str, np.ndarray]) -> Pose:
+def _look(network: Policy, pairs: dict[str, np.ndarray]) -> tuple[Pose, Tensor]:
     goals = network.encode_goals(torch.from_numpy(pairs['goal']))
-    _, features = network.encode(torch.from_numpy(pairs['image']), goals, None)
-    return network.heads['goal_pose'](features)
+    maps, features = network.encode(torch.from_numpy(pairs['image']), goals, None)
+    return network.heads['goal_pose'](features), maps
 
 
 def _angle(one: Tensor, other: Tensor) -> Tensor:

@@ -37,6 +37,7 @@ class Rollout:
     state: RecurrentState  # before the first row
     # [T+1,B,...] What a simulator knows and the network must not see: targets of losses.
     privileged: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+    driven: Tensor | None = None  # [T,B] bool: a teacher chose the action, not the policy
     # When it was chosen and seen; None where nobody wrote it down (replay, bags).
     log_probability: Tensor | None = None  # [T,B] of the action
     value: Tensor | None = None  # [T+1,B]
@@ -87,6 +88,7 @@ class Collector:
         n = env.num_envs
         self.observation: dict[str, Tensor] = {}
         self.starts = torch.ones(n, dtype=torch.bool, device=self.device)
+        self.driven = torch.zeros_like(self.starts)  # by a teacher, in this episode
         self.state = network.initial_state(n)
         # Of each environment's present episode: its number, return, decisions and collisions.
         self._totals = tuple(torch.zeros(n, dtype=dtype, device=self.device) for dtype in (
@@ -107,8 +109,18 @@ class Collector:
             total.zero_()
 
     @torch.no_grad()
-    def collect(self, steps: int) -> tuple[Rollout, list[Episode]]:
-        """Act for a number of steps; also the episodes that ended, in the order of their ends."""
+    def collect(self, steps: int, teacher: str | None = None, share: float = 0.0
+                ) -> tuple[Rollout, list[Episode]]:
+        """Act for a number of steps.
+
+        Args:
+            steps: of every environment.
+            teacher: privileged key of the actions that drive a part of the episodes.
+            share: of the episodes that begin now which it drives to their ends.
+
+        Returns:
+            What happened, and the policy's own episodes that ended, in the order of their ends.
+        """
         n, size = self.env.num_envs, self.observation['image'].shape[-1]
         flag, real, whole = torch.bool, torch.float32, torch.int64
 
@@ -124,7 +136,8 @@ class Collector:
         rollout = Rollout(
             seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
             empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, told,
-            empty(steps, real), empty(steps + 1, real))
+            None if teacher is None else empty(steps, flag), empty(steps, real),
+            empty(steps + 1, real))
         facts = empty(steps, torch.float64, 1 + len(self._totals))
         goal_maps = self._goal_maps()
         for t in range(steps + 1):
@@ -135,6 +148,9 @@ class Collector:
             for key, rows in told.items():
                 rows[t] = self.told[key]
             rollout.starts[t] = self.starts
+            if teacher is not None:
+                drawn = torch.rand(n, device=self.device, generator=self.generator) < share
+                self.driven = torch.where(self.starts, drawn, self.driven)
             now = slice(t, t + 1)
             extras = seen.extras and {key: rows[now] for key, rows in seen.extras.items()}
             row = Observation(image[now], None, None, seen.last_action[now],
@@ -147,10 +163,14 @@ class Collector:
             self.state = state
             log_probability = torch.log_softmax(output.logits[0], dim=-1)
             action = self._sample(log_probability)
+            if teacher is not None:
+                rollout.driven[t] = self.driven
+                action = torch.where(self.driven[:, None], told[teacher][t][:, None], action)
             rollout.action[t] = action[:, 0]
             rollout.log_probability[t] = log_probability.gather(1, action)[:, 0]
             facts[t] = self._step(rollout, t)
-        return rollout, _episodes(rollout.terminated | rollout.truncated, facts)
+        ended = rollout.terminated | rollout.truncated
+        return rollout, _episodes(ended if teacher is None else ended & ~rollout.driven, facts)
 
     def _tensor(self, rows) -> Tensor:
         """Rows of the environment, on the network's device; shared where they are there."""
@@ -235,7 +255,7 @@ class Collector:
         return {
             'observation': {name: copy(rows) for name, rows in self.observation.items()},
             'told': {key: copy(rows) for key, rows in self.told.items()},
-            'starts': copy(self.starts),
+            'starts': copy(self.starts), 'driven': copy(self.driven),
             'memory': [copy(part) for part in self.state],
             'totals': [copy(total) for total in self._totals],
         }
@@ -246,6 +266,7 @@ class Collector:
                             for name, rows in state['observation'].items()}
         self.told = {key: self._tensor(rows) for key, rows in state['told'].items()}
         self.starts = self._tensor(state['starts'])
+        self.driven = self._tensor(state['driven'])
         self.state = RecurrentState(*map(self._tensor, state['memory']))
         for total, saved in zip(self._totals, state['totals'], strict=True):
             total.copy_(saved)

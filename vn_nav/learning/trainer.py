@@ -243,7 +243,11 @@ class _Training:
     def update(self) -> dict:
         """Collect one rollout, learn from it, and say how it went (the keys of `COLUMNS`)."""
         start = time.monotonic()
-        rollout, episodes = self.collector.collect(self.config.rollout_length)
+        config = self.config
+        share = config.teacher_share * max(1 - self.progress / config.teacher_until, 0.0)
+        rollout, episodes = self.collector.collect(
+            config.rollout_length, f'{config.teacher}_action' if config.teacher_share else None,
+            share)
         middle = time.monotonic()
         with written(self.folder / REPLAY):
             losses = self.learner.update(rollout, self.progress)

@@ -269,10 +269,14 @@ class Policy(nn.Module):
         hidden, state = self.memory(torch.cat(inputs, dim=-1), starts, state)
         return Latents(maps, features, hidden, pose), state
 
-    def maps(self, obs: Observation) -> Tensor:
-        """The encoder's last maps [T*B,C,h,w] of T consecutive steps of an episode each."""
-        starts = torch.zeros_like(obs.last_action, dtype=torch.bool)
-        starts[0] = True
+    def maps(self, obs: Observation, starts: Tensor | None = None) -> Tensor:
+        """The encoder's last maps [T*B,C,h,w].
+
+        `starts` [T,B] as in `forward`; left out: T consecutive steps of one episode each.
+        """
+        if starts is None:
+            starts = torch.zeros_like(obs.last_action, dtype=torch.bool)
+            starts[0] = True
         return self._look(obs, starts, self.initial_state(starts.shape[1]), None)[0]
 
     def _look(self, obs: Observation, starts: Tensor, state: RecurrentState,
