@@ -46,7 +46,8 @@ def device_env(config=CONFIG):
 def learning(name, env, **changes):
     """Collector and learner of a preset, as the trainer makes them."""
     torch.manual_seed(0)
-    config = preset(name, imitation=0.0, pair_minutes=0.0, features=32, hidden=32, **changes)
+    config = preset(name, imitation=0.0, teacher_share=0.0, pair_minutes=0.0, features=32,
+                    hidden=32, **changes)
     network = Policy(config.network(tuple(env.action_names), env.goals.shape[-1]))
     draws = torch.Generator().manual_seed(1)
     collector = Collector(env, network, draws, config.privileged)

@@ -328,7 +328,7 @@ def test_rows_that_are_no_frames_change_nothing():
     rollout = collected(network, rollouts=3)
     spoilt = dataclasses.replace(rollout, action=rollout.action.clone(),
                                  log_probability=rollout.log_probability.clone())
-    spoilt.action[~rollout.valid] = 2
+    spoilt.action[~rollout.valid] = 1 - spoilt.action[~rollout.valid]
     spoilt.log_probability[~rollout.valid] = -30.0
     assert not rollout.valid.all()
     results = []

@@ -64,7 +64,7 @@ def test_another_order_of_actions_is_refused(tmp_path):
     """Trap 8: neither a resumed training nor one with given weights swaps actions silently."""
     folder = train(TwoBars(6), QUICK, tmp_path / 'run', info=FACTS)
     swapped = TwoBars(6)
-    swapped.action_names = ('right', 'left', 'wait')
+    swapped.action_names = ('right', 'left')
     with pytest.raises(UserError, match='action'):
         train(swapped, dataclasses.replace(QUICK, frames=1600), tmp_path / 'run', info=FACTS,
               resume=True)

@@ -2,8 +2,9 @@
 
 A red and a green bar stand left and right of the robot, which side is which drawn anew; the goal
 picture shows one of the two. Turning to that bar ends the episode with reward 1, turning to the
-other one with reward 0, and after `LIMIT` decisions it is cut off. Either picture alone tells
-nothing: without looking at both, half of the turns are right.
+other one with reward 0. Some turns slip: nothing happens but that the bars come closer, and after
+`LIMIT` decisions the episode is cut off. Either picture alone tells nothing: without looking at
+both, half of the turns are right.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from vn_nav.learning.rollout import Collector
 from vn_nav.policy.network import Policy
 from vn_nav.policy.runtime import BatchedPolicy
 
-ACTIONS = ('left', 'right', 'wait')
-LIMIT = 4  # decisions
+ACTIONS = ('left', 'right')
+LIMIT = 2  # decisions
+SLIP = 0.3  # probability that a turn has no effect
 RED, GREEN = (235, 0, 0), (0, 235, 0)
 RIGHT, BLANK = 'right', 'blank'
 # All that auxiliary tasks may ask for.
@@ -38,10 +40,11 @@ class TwoBars:
 
     def __init__(self, num_envs: int = 16, size: int = 36):
         self.num_envs, self.size = num_envs, size
-        self.goals = np.full((3, 3, size, size), 128, np.uint8)
+        self.goals = np.full((3, 3, size, size), 15, np.uint8)
         self.goal_segmentation = np.zeros((3, size, size), np.uint8)
         self.blank_goal = 2
-        bar = slice(size // 3, size - size // 3)
+        self.goals[2] = 128
+        bar = slice(size // 6, size - size // 6)
         for kind, colour in enumerate((RED, GREEN)):
             self.goals[kind, :, :, bar] = np.reshape(colour, (3, 1, 1))
             self.goal_segmentation[kind, :, bar] = 1 + kind
@@ -77,7 +80,7 @@ class TwoBars:
     def step(self, actions):
         reset, acting = self.done.copy(), ~self.done
         self._begin(np.nonzero(reset)[0])
-        turned = acting & (actions < 2)
+        turned = acting & (self.random.random(self.num_envs) >= SLIP)
         success = turned & (actions == self._wanted())
         self.facing[turned] = 1 + np.asarray(actions)[turned]
         self.step_count[acting] += 1
@@ -93,7 +96,7 @@ class TwoBars:
         n = len(env_ids)
         self.red_left[env_ids] = self.random.integers(0, 2, n) > 0
         self.goal[env_ids] = self.random.integers(0, 2, n)
-        self.grey[env_ids] = self.random.integers(110, 140, n)
+        self.grey[env_ids] = self.random.integers(0, 20, n)
         self.step_count[env_ids] = self.facing[env_ids] = 0
         self.last_action[env_ids], self.last_reward[env_ids] = -1, 0.0
 
@@ -105,15 +108,14 @@ class TwoBars:
         """[N,S,S] 0 nothing, 1 red, 2 green."""
         side = self.size
         labels = np.zeros((self.num_envs, side, side), np.uint8)
-        width = round(side / 3 * (1.25 - self.tau / 2))
+        width = round(side * (0.48 - 0.12 * self.tau))
         left = np.where(self.red_left, 1, 2)[:, None, None]
         ahead = self.facing == 0
-        # Waiting lets the bars come a pixel closer, so that there is something to see of it.
         for n in np.nonzero(ahead)[0]:
-            near = 2 + self.step_count[n]
-            labels[n, near:-near, 2:2 + width] = left[n]
-            labels[n, near:-near, side - 2 - width:side - 2] = 3 - left[n]
-        bar = slice(side // 3, side - side // 3)
+            near = 4 - 2 * self.step_count[n]
+            labels[n, near:side - near, 2:2 + width] = left[n]
+            labels[n, near:side - near, side - 2 - width:side - 2] = 3 - left[n]
+        bar = slice(side // 6, side - side // 6)
         labels[~ahead, :, bar] = np.where(self.facing[~ahead, None, None] == 1, left[~ahead],
                                           3 - left[~ahead])
         return labels
@@ -152,16 +154,16 @@ def collected(network: Policy, steps: int = 9, envs: int = 6, seed: int = 0, rol
     return rollout
 
 
-def success(network: Policy, episodes: int, mode: str = RIGHT, seed: int = 99) -> float:
-    """Share of right turns of a sampling policy; as many episodes in every environment."""
+def success(network: Policy, turns: int, mode: str = RIGHT, seed: int = 99) -> float:
+    """Share of a sampling policy's turns that are right; as many of them in every environment."""
     env = TwoBars(32, network.config.size)
     env.set_shown_goal(mode)
     policy = BatchedPolicy(network, env.num_envs, seed=seed)
     observation, info = env.reset(seed=seed)
     rights = [[] for _ in range(env.num_envs)]
-    while min(map(len, rights)) < episodes // env.num_envs:
+    while min(map(len, rights)) < turns // env.num_envs:
         actions = policy.act(observation, env.goals, info['reset'])
-        observation, _, terminated, truncated, info = env.step(actions)
-        for n in np.nonzero(terminated | truncated)[0]:
+        observation, _, terminated, _, info = env.step(actions)
+        for n in np.nonzero(terminated)[0]:
             rights[n].append(bool(info['success'][n]))
-    return float(np.mean([ends[:episodes // env.num_envs] for ends in rights]))
+    return float(np.mean([ends[:turns // env.num_envs] for ends in rights]))

@@ -538,8 +538,8 @@ class WarpNavigationEnv:
                             (config.stop, config.exploration_reward), 'use NavigationEnv')
         if teachers := sorted(set(config.privileged) & set(TEACHERS)):
             raise UserError('teachers plan on the CPU: the device tells no actions to imitate',
-                            ', '.join(teachers), 'set imitation=0 (--set imitation=0), or train '
-                            'on the CPU')
+                            ', '.join(teachers), 'set imitation=0 and teacher_share=0 (--set '
+                            'NAME=VALUE), or train on the CPU')
         if config.randomisation.late_picture:
             raise UserError('pictures are never late on the device',
                             config.randomisation.late_picture, 'use NavigationEnv')

@@ -175,8 +175,8 @@ def run_training(arguments, name: str, envs: int, minutes: float, folder: Path, 
     """Train a preset on the device; the rows of its metrics."""
     from vn_nav.learning.presets import ENVIRONMENT, preset
     from vn_nav.learning.trainer import train
-    config = preset(name, imitation=0.0, pair_minutes=0.0, frames=10**9, minutes=minutes,
-                    device=arguments.device, checkpoint_seconds=3600.0, **changes)
+    config = preset(name, imitation=0.0, teacher_share=0.0, pair_minutes=0.0, frames=10**9,
+                    minutes=minutes, device=arguments.device, checkpoint_seconds=3600.0, **changes)
     told = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap'}
     world = {**ENVIRONMENT[name], **world, 'num_envs': envs}
     del world['envs']

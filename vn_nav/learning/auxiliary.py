@@ -22,7 +22,6 @@ from vn_nav.learning.pixel_change import (
 )
 from vn_nav.learning.returns import masked_mean, n_step_q, n_step_returns
 from vn_nav.learning.rollout import Rollout
-from vn_nav.policy.heads import NEAR
 from vn_nav.policy.network import Latents, Policy
 
 MAX_DEPTH = 10.0  # m, white in the depth target
@@ -120,25 +119,17 @@ def pose_loss(position: Tensor, heading: Tensor, overlap_logit: Tensor, goal_pos
               overlap: Tensor, valid: Tensor) -> Tensor:
     """Loss of a relative pose: Huber on position and heading, cross-entropy on the overlap.
 
-    Positions are compared after `_shrink`: a metre counts for less where the goal is far.
-
     Args:
         position: [N,2] m; heading: [N,2] cos, sin; overlap_logit: [N]: see `heads.Pose`.
         goal_pose: [N,4] x, y [m], cos, sin; overlap: [N] share of the goal picture in view.
         valid: [N] bool.
     """
     sees = (overlap >= POSE_OVERLAP)
-    error = (F.smooth_l1_loss(_shrink(position), _shrink(goal_pose[:, :2]),
-                              reduction='none').sum(1)
+    error = (F.smooth_l1_loss(position, goal_pose[:, :2], reduction='none').sum(1)
              + 2 * F.smooth_l1_loss(heading, goal_pose[:, 2:], reduction='none').sum(1))
     seen = masked_mean(error, valid & sees)
     overlaps = F.binary_cross_entropy_with_logits(overlap_logit, sees.float(), reduction='none')
     return seen + masked_mean(overlaps, valid)
-
-
-def _shrink(position: Tensor) -> Tensor:
-    """Positions [N,2] m with their distance d shortened to d / (1 + d / `NEAR`)."""
-    return position / (1 + position.norm(dim=1, keepdim=True) / NEAR)
 
 
 def arrival_loss(network: Policy, latents: Latents, rollout: Rollout) -> Tensor:

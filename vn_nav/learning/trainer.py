@@ -102,7 +102,8 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
 
 def _initial_weights(source: str | Path, network: Policy) -> dict[str, torch.Tensor]:
     """The weights of a checkpoint, and a network's own for heads that the checkpoint lacks."""
-    own, given = network.state_dict(), load_checkpoint(source).network.state_dict()
+    own = network.state_dict()
+    given = load_checkpoint(source, network.config.actions).network.state_dict()
     for name, tensor in own.items():
         if name not in given and name.startswith('heads.'):
             given[name] = tensor
