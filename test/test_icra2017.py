@@ -344,7 +344,7 @@ def test_unknown_scenes_are_refused():
 
 
 def test_scenes_change_what_a_policy_does():
-    network = Policy(dataclasses.replace(SCENES, actions=TwoBars.action_names))
+    network = Policy(SCENES)
     for scene in range(3):
         network.actor.bias.data[scene, scene] = 50.0
     env = TwoBars(3)

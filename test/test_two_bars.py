@@ -7,7 +7,7 @@ import pytest
 import torch
 from two_bars import BLANK, LIMIT, SLIP, TwoBars, success
 
-from vn_nav.learning.presets import preset
+from vn_nav.learning.presets import PRESETS, preset
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import load_checkpoint
 
@@ -15,8 +15,9 @@ FACTS = {'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
 # A small budget: short rollouts, a rate that suits them, and windows no longer than episodes.
 A2C = {'frames': 20_000, 'rollout_length': 5, 'learning_rate': 1e-3, 'hidden': 128,
        'replay_steps': 2000, 'replay_length': LIMIT + 1}
-BUDGETS = {
+BUDGETS: dict[str, dict] = {
     'a2c': A2C, 'unreal': A2C, 'framestack': A2C, 'thesis': A2C,
+    'icra2017': {'frames': 20_000, 'learning_rate': 1e-2, 'hidden': 128},
     # By reinforcement alone: a teacher would give the answer away.
     'fast': {'frames': 8000, 'imitation': 0.0, 'teacher_share': 0.0, 'pair_minutes': 0.0},
 }
@@ -56,6 +57,10 @@ def test_slips_are_cut_off_and_the_other_bar_earns_nothing():
         assert (observation['image'] != seen).reshape(64, -1).any(axis=1)[slipped].all()
         cut += truncated.sum()
     assert cut > 30
+
+
+def test_no_preset_is_left_out():
+    assert set(BUDGETS) == set(PRESETS)
 
 
 def stop_when_learned(row):

@@ -250,6 +250,9 @@ class Policy(nn.Module):
         steps, batch = starts.shape
         if state is None:
             state = self.initial_state(batch)
+            if self.config.frames > 1:  # no pictures before: the first one stands for them
+                starts = starts.clone()
+                starts[0] = True
         maps, features, state = self._look(obs, starts, state, goal_maps)
         if self.frozen:
             scene = self._scene(obs)
