@@ -286,11 +286,12 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that changes from step to step; with equal switches `set_state` goes on."""
         objects = self.backend.objects
-        houses = {'house_index': self.house_index.copy()} if self._wanders else {}
-        return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed), **houses,
+        more = {'house_index': self.house_index.copy()} if self._wanders else {}
+        if self._explorer is not None:
+            more |= {'explorer_seen': self._explorer.seen.copy(),
+                     'explorer_found': self._explorer.found.copy()}
+        return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed), **more,
                 **{name.strip('_'): getattr(self, name).copy() for name in self._state},
-                **({} if self._explorer is None else {'explorer_seen': self._explorer.seen.copy(),
-                    'explorer_found': self._explorer.found.copy()}),
                 **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
                 **{f'task_{name}': part.copy() for name, part in self.task.state.items()}}
 

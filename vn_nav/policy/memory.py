@@ -100,7 +100,6 @@ class MaskedLSTM(nn.Module):
                                           keep, inputs.dtype)
         return outputs, RecurrentState(outputs[-1], cell)
 
-
     def _one_step(self, gates: Tensor, keep: Tensor, state: RecurrentState
                   ) -> tuple[Tensor, RecurrentState]:
         """What `_Recurrence` computes for T = 1, in plain operations."""
