@@ -111,7 +111,7 @@ def test_only_the_task_of_pictures_and_a_robot_that_turns_have_a_teacher():
 def test_episodes_driven_by_the_teacher(share):
     torch.manual_seed(0)
     env = make_env(privileged=('explorer_action', 'overlap', 'goal_pose'), max_decisions=12)
-    config = preset('fast')
+    config = preset('fast', imitation=1.0)
     network = Policy(config.network(env.action_names, 36))
     collector = Collector(env, network, torch.Generator().manual_seed(0), config.privileged)
     collector.begin(0)
@@ -129,6 +129,6 @@ def test_episodes_driven_by_the_teacher(share):
 
 def test_a_teacher_needs_the_task_that_follows_it():
     with pytest.raises(UserError, match='imitation'):
-        preset('fast', imitation=0.0)
-    assert preset('fast', imitation=0.0, teacher_share=0.0).privileged == (
-        'goal_pose', 'overlap', 'arrived', 'distance')
+        preset('fast', teacher_share=0.5)
+    assert preset('fast', imitation=1.0, teacher='oracle').privileged[-1] == 'oracle_action'
+    assert preset('fast').privileged == ('goal_pose', 'overlap', 'arrived', 'distance')

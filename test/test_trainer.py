@@ -134,13 +134,13 @@ def test_a_small_room_is_learned(tmp_path):
                          channels=(16, 32, 32), features=128, hidden=128, learning_rate=1e-3,
                          final_learning_rate=2e-4, start_difficulty=1.0)
     folder = train(env, config, tmp_path / 'run', info=FACTS)
-    from vn_nav.evaluation.evaluator import policy_actor, random_actor, run_episodes
+    from vn_nav.evaluation.evaluator import PolicyActor, random_actor, run_episodes
     from vn_nav.evaluation.metrics import summarise
     from vn_nav.robot import RobotSpec
     test = make_env(**options)
     network = load_checkpoint(folder).network
     learned, chance = (summarise(run_episodes(test, actor, 128, seed=9, robot=RobotSpec()))
-                       for actor in (policy_actor(test, network, 'sample', 0),
+                       for actor in (PolicyActor(test, network, 'sample', 0),
                                      random_actor(test, 0)))
     print(f'learned {learned["success"]:.2f}, random {chance["success"]:.2f}')
     assert learned['success'] >= 0.75 and learned['success'] > chance['success'] + 0.25

@@ -252,7 +252,7 @@ def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, control
                        objects=info['objects'], actions=checkpoint.config.actions,
                        max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
                        goals_per_room=info['goals_per_room'] if own else 1)
-        plans.update({house.seed: _floor_plan(house) for house in env.houses})
+        plans.update({house.seed: house.floor_plan() for house in env.houses})
         return env
 
     wanted = evaluator.CONTROLS if controls else ()
@@ -265,19 +265,6 @@ def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, control
         threshold=info.get('stop_threshold') if threshold is None else threshold,
         robot=load_robot(robot) if robot else None)
     return rows, plans
-
-
-def _floor_plan(house) -> dict:
-    """What a map needs of a house, as on the bridge's topic `scene`."""
-    return {
-        'house': house.seed, 'bounds': list(house.outline), 'area': house.area,
-        'rooms_list': [{'name': room.name, 'rect': list(room.rect)} for room in house.rooms],
-        'walls': [list(o.rect) for o in house.obstacles if o.label == 'wall'],
-        'obstacles': [[*o.rect, o.label] for o in house.obstacles
-                      if o.label not in ('wall', 'outside')],
-        'outside': [list(o.rect) for o in house.obstacles if o.label == 'outside'],
-        'goals': [{'room': goal.room, 'pose': list(goal.pose)} for goal in house.goals],
-    }
 
 
 def _splits(args, info: dict) -> dict[str, list[int]]:

@@ -150,16 +150,8 @@ class SimBridgeNode(Node):
         house = self.robot.house
         return {
             'world_version': WORLD_VERSION,
-            'house': house.seed,
             'rooms': len(house.rooms),
-            'bounds': list(house.outline),
-            'area': house.area,
-            'rooms_list': [{'name': room.name, 'rect': list(room.rect)} for room in house.rooms],
-            'walls': [list(o.rect) for o in house.obstacles if o.label == 'wall'],
-            'obstacles': [[*o.rect, o.label] for o in house.obstacles
-                          if o.label not in ('wall', 'outside')],
-            'outside': [list(o.rect) for o in house.obstacles if o.label == 'outside'],
-            'goals': [{'room': goal.room, 'pose': list(goal.pose)} for goal in house.goals],
+            **house.floor_plan(),
             'arrival': {'radius': tasks.ARRIVAL_RADIUS,
                         'heading_deg': math.degrees(tasks.ARRIVAL_HEADING)},
             'camera_fov_deg': math.degrees(self.robot.robot.camera_fov),

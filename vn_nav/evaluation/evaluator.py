@@ -125,11 +125,6 @@ class PolicyActor:
         return bool(np.isfinite(self.policy.arrival).all())
 
 
-def policy_actor(env, network: Policy, decoding: str, seed: int) -> Actor:
-    """A trained policy, see `PolicyActor`."""
-    return PolicyActor(env, network, decoding, seed)
-
-
 def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decoding: str,
             episodes: int = 100, controls: Sequence[str] = CONTROLS,
             threshold: float | None = None, seed: int = 10_000, known: Sequence[int] = (),

@@ -10,7 +10,7 @@ starts from it; every number can be changed from the command line.
 | `a2c` | the same without any auxiliary task |
 | `framestack` | `unreal` with the last four pictures and a linear layer instead of the LSTM (thesis, 5.4) |
 | `icra2017` | Zhu et al. 2017: frozen features of four pictures, siamese layers, layers of its own for each scene; 10 at the goal, -0.01 a step (sections IV-B and IV-C) |
-| `fast` | PPO, early fusion, GAE, Adam, goal poses; imitation of a teacher that is weighted down to nothing |
+| `fast` | PPO, early fusion, GAE, Adam, success-driven curriculum; goal poses, learned from picture pairs first |
 """  # noqa: E501
 
 from __future__ import annotations
@@ -130,8 +130,7 @@ PRESETS: dict[str, dict] = {
         'minibatches': 4, 'entropy_coefficient': 0.008, 'final_entropy_coefficient': 0.003,
         'frames': 1_600_000, 'rollout_length': 32, 'channels': (16, 32, 64), 'features': 256,
         'hidden': 256, 'goal_pose': 0.5, 'arrival': 0.2, 'distance': 0.1,
-        'pose_to_memory': True, 'pair_minutes': 5.0, 'imitation': 1.0, 'imitation_until': 0.6,
-        'teacher_share': 0.5, 'teacher_until': 0.4, 'start_difficulty': 1.0,
+        'pose_to_memory': True, 'pair_minutes': 2.0, 'pair_houses': 32,
     },
 }
 _THESIS_ENVIRONMENT = {'envs': 16, 'max_decisions': 900, 'progress_reward': 0.0,

@@ -81,6 +81,18 @@ class House:
                 return room.name
         return ''
 
+    def floor_plan(self) -> dict:
+        """What a map needs of the house, ready for JSON; lengths in m, poses as in `Goal`."""
+        return {
+            'house': self.seed, 'bounds': list(self.outline), 'area': self.area,
+            'rooms_list': [{'name': room.name, 'rect': list(room.rect)} for room in self.rooms],
+            'walls': [list(o.rect) for o in self.obstacles if o.label == 'wall'],
+            'obstacles': [[*o.rect, o.label] for o in self.obstacles
+                          if o.label not in ('wall', 'outside')],
+            'outside': [list(o.rect) for o in self.obstacles if o.label == 'outside'],
+            'goals': [{'room': goal.room, 'pose': list(goal.pose)} for goal in self.goals],
+        }
+
     def room_index(self, x: float, y: float) -> int:
         """Index of the room nearest to a point."""
         gaps = [math.hypot(max(r.x0 - x, 0, x - r.x1), max(r.y0 - y, 0, y - r.y1))
