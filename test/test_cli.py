@@ -35,13 +35,19 @@ def run(*words):
     (['demo', '--checkpoint', '/nowhere', '--out', 'OUT'], 'checkpoint'),
     (['demo', '--episodes', '0', '--out', 'OUT'], 'episode'),
 ])
-def test_bad_input_is_one_line(tmp_path, words, expected):
+def test_bad_input_is_one_line(tmp_path, capsys, words, expected):
     out = tmp_path / 'out'
-    done = run(*[word.replace('OUT', str(out)) for word in words])
-    assert done.returncode == 2, done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
-    assert expected in done.stderr and 'received' in done.stderr
+    assert main([word.replace('OUT', str(out)) for word in words]) == 2
+    said = capsys.readouterr().err
+    assert len(said.strip().splitlines()) == 1, said
+    assert expected in said and 'received' in said
     assert not out.exists()
+
+
+def test_the_process_ends_with_that_line_and_exit_code_2():
+    done = run('evaluate', '/nowhere')
+    assert done.returncode == 2 and done.stderr.startswith('vn_nav: ')
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_another_world_version_is_refused_with_the_remedy(tmp_path, capsys):
