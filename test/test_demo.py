@@ -70,6 +70,7 @@ def test_every_figure_is_in_the_bag(demo):
         assert figures['random']['episodes'] == count
 
 
+@pytest.mark.slow  # a second drive over ROS
 def test_declared_stops_are_counted_from_the_bag(tmp_path):
     sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
     assert main(['demo', '--out', str(tmp_path / 'out'), '--checkpoint', str(sure),
