@@ -42,7 +42,8 @@ test-all: $(READY_ALL)
 
 # `make test-all` kills 20 times.
 soak: $(READY)
-	@VN_NAV_KILLS=200 $(BIN)/python -m pytest test/test_survival.py -k loses_no_committed_update
+	@VN_NAV_KILLS=200 $(BIN)/python -m pytest test/test_survival.py test/test_distributed.py \
+	 -k 'loses_no_committed_update or torchrun_replaces'
 
 lint: $(READY)
 	@$(BIN)/python -m ruff check .

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from vn_nav.learning import returns
 
 WAIT = 30.0  # min that a process waits for another one
+CONNECT = 1.0  # min that it waits for all of them at the start, see `Processes.join`
 
 
 class Objective(nn.Module):
@@ -72,7 +73,10 @@ class Processes:
             if gpu:  # the one that `cuda` names from here on
                 torch.cuda.set_device(int(os.environ['LOCAL_RANK']) % torch.cuda.device_count())
             dist.init_process_group('cpu:gloo,cuda:nccl' if gpu else 'gloo',
-                                    timeout=datetime.timedelta(minutes=WAIT + patience))
+                                    timeout=datetime.timedelta(minutes=CONNECT))
+            # After a restart gloo sometimes waits for ever until all are connected (seen with
+            # torch 2.13): then this attempt fails soon, and torchrun makes the next one.
+            dist.distributed_c10d._set_pg_timeout(datetime.timedelta(minutes=WAIT + patience))
         restarts = os.environ['TORCHELASTIC_RESTART_COUNT'] if launched else 0
         processes = cls(dist.get_rank(), dist.get_world_size(), int(restarts) > 0)
         processes.owner = owner
