@@ -16,13 +16,12 @@ import numpy as np
 import torch
 from common import pin, report
 
-from vn_nav.cli import ENV_PRIVILEGED
 from vn_nav.learning.learner import Learner
 from vn_nav.learning.presets import ENVIRONMENT, preset
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector
 from vn_nav.policy.network import Policy
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.env import PRIVILEGED, EnvConfig, NavigationEnv
 
 WARM_UP = 4  # updates
 
@@ -39,7 +38,7 @@ class Training:
         world = dict(ENVIRONMENT[name])
         env = NavigationEnv(EnvConfig(
             houses=(3,), rooms=2, num_envs=world.pop('envs'),
-            privileged=tuple(sorted(set(config.privileged) & ENV_PRIVILEGED)), **world),
+            privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world),
             threads=threads)
         torch.manual_seed(0)
         self.network = Policy(config.network(tuple(env.action_names), 84))

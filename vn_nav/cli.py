@@ -24,8 +24,6 @@ from vn_nav.evaluation.command import (
 from vn_nav.learning.command import add_train_options, train_config, world_options
 
 BACKENDS = ('house',)
-ENV_PRIVILEGED = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap',
-                  'explorer_action', 'oracle_action'}
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
@@ -150,6 +148,7 @@ def run_train(args) -> int:
     """`vn_nav train`."""
     _check_backend(args.backend)
     from vn_nav.learning.trainer import train
+    from vn_sim_bridge.env import PRIVILEGED
     from vn_sim_bridge.houses.splits import SPLITS
     if args.house and args.houses:
         raise UserError('a training is in named houses or in the first N', '--house and --houses',
@@ -162,7 +161,7 @@ def run_train(args) -> int:
                    actions=tuple(args.actions.split(',')), task=args.task,
                    objects=args.objects, goals_per_room=args.goals_per_room,
                    goal_variants=args.goal_variants,
-                   privileged=tuple(sorted(set(config.privileged) & ENV_PRIVILEGED)), **world)
+                   privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
     words = [word for word in sys.argv[1:] if word != '--resume']
     info = {
         'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
