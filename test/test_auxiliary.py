@@ -241,6 +241,8 @@ CONVOLUTIONS = {
     'unreal': ('encoder.first', 'encoder.conv2'),
     'fused': ('encoder.first', 'encoder.stage1', 'encoder.conv2', 'encoder.stage2',
               'encoder.conv3'),
+    'matching': ('encoder.first', 'encoder.conv2', 'encoder.query', 'encoder.key', 'encoder.fuse',
+                 'encoder.stage'),
 }
 MAPS, FEATURES, MEMORY = 'the convolutions', 'encoder.trunk', 'memory'
 # Which parameters each loss teaches: these and no others.
@@ -288,11 +290,12 @@ def losses(network, rollout, latents):
 
 @pytest.mark.parametrize('kind, changes', [
     ('thesis', {}), ('thesis', {'frames': 3}), ('thesis, 128 px', {'deconvolutions': 2}),
-    ('unreal', {}), ('fused', {}), ('fused', {'pose_to_memory': True})])
+    ('unreal', {}), ('fused', {}), ('fused', {'pose_to_memory': True}),
+    ('matching', {'pose_to_memory': True, 'moves': ((0.5, 0.0, 0.0), (0.0, 0.0, 0.5))})])
 def test_gradients_reach_the_layers_they_should_and_no_others(kind, changes):
     network = network_of(kind.split(',')[0], 128 if '128' in kind else 36, **changes)
     for block in (module for name, module in network.named_modules() if name.endswith('stage1.0')
-                  or name.endswith('stage2.0')):
+                  or name.endswith(('stage2.0', 'stage.0'))):
         torch.nn.init.normal_(block.conv2.weight, std=0.1)  # its zeros would stop the gradient
     groups = {*CONVOLUTIONS[kind], FEATURES, MEMORY, 'actor', 'critic',
               *(f'heads.{name}' for name in HEADS)}
@@ -312,7 +315,7 @@ def test_gradients_reach_the_layers_they_should_and_no_others(kind, changes):
         assert reached == expected, task
 
 
-@pytest.mark.parametrize('architecture', ['thesis', 'fused'])
+@pytest.mark.parametrize('architecture', ['thesis', 'fused', 'matching'])
 def test_the_goal_stream_learns_from_every_task_that_looks_at_the_goal(architecture):
     network = network_of(architecture)
     rollout = collected(network)

@@ -15,13 +15,15 @@ from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import INFO, LoadedCheckpoint, save_checkpoint
 from vn_nav.policy.export import OPSET, export_onnx
 from vn_nav.policy.network import NetworkConfig, Policy
-from vn_nav.robot import DRIVE_ACTIONS
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 STEPS, RESET = 20, 11
 FACTS = {'world_version': '1', 'camera_fov_deg': 75.0, 'camera_height': 0.4,
          'decoding': 'greedy', 'stop_threshold': 0.5}
 NETWORKS = {
     'fused': {'heads': ('goal_pose', 'arrival', 'distance'), 'pose_to_memory': True, 'blocks': 1},
+    'matching': {'architecture': 'matching', 'heads': ('goal_pose', 'arrival'),
+                 'pose_to_memory': True, 'moves': RobotSpec().with_actions(DRIVE_ACTIONS).moves},
     'thesis': {'architecture': 'thesis', 'heads': ('pixel_control', 'depth')},
     'thesis at 174': {'architecture': 'thesis', 'size': 174},
     'unreal': {'architecture': 'unreal'},

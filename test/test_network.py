@@ -17,6 +17,7 @@ from vn_nav.robot import DRIVE_ACTIONS
 SMALL = NetworkConfig(actions=DRIVE_ACTIONS, size=36, channels=(8, 8, 8), features=24, hidden=16)
 # Of icra2017, which has no heads, test_icra2017.py says the same.
 OURS = [name for name in ARCHITECTURES if name != 'icra2017']
+MOVES = ((0.5, 0.0, 0.0), (-0.2, 0.0, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, -0.5))
 EVERY = [(name, frames) for name in OURS for frames in (1, 3)]
 
 
@@ -291,12 +292,14 @@ def somewhere(network, envs):
         before = torch.randint(0, 256, (envs, network.config.frames - 1, 3, 36, 36),
                                dtype=torch.uint8)
         return RecurrentState(before, torch.zeros(envs, 0))
-    return RecurrentState(*torch.randn(2, envs, 16))
+    state = network.initial_state(envs)
+    return RecurrentState(*(torch.randn_like(part) for part in state))
 
 
 @pytest.mark.parametrize('architecture, frames', EVERY)
 def test_stepwise_equals_the_sequence_across_resets(architecture, frames):
-    network = changed(architecture, frames, heads=('goal_pose', 'arrival'), pose_to_memory=True)
+    network = changed(architecture, frames, heads=('goal_pose', 'arrival'), pose_to_memory=True,
+                      moves=MOVES if frames == 1 else ())
     observation, starts = batch()
     state = somewhere(network, 3)
     whole, last = network(observation, starts, state)
@@ -324,6 +327,28 @@ def test_nothing_of_an_episode_reaches_the_next(architecture, frames):
     alone, _ = network(later, starts[3:])
     assert torch.allclose(whole.logits[3:], alone.logits, atol=1e-5)
     assert torch.allclose(whole.value[3:], alone.value, atol=1e-5)
+
+
+def test_the_correlation_volume_is_every_cosine():
+    network = changed('matching', 1)
+    encoder, (observation, _) = network.encoder, batch(1, 2)
+    seen = encoder.see(observation.image[0], torch.float32)
+    goals = network.encode_goals(observation.goals[:2])
+    query = torch.nn.functional.conv2d(seen, encoder.query.weight, encoder.query.bias)
+    volume = torch.empty(2, goals.shape[2] * goals.shape[3], *seen.shape[2:])
+    for n in range(2):
+        for place in range(volume.shape[1]):
+            goal = goals[n].flatten(1)[:, place]
+            for row in range(volume.shape[2]):
+                for column in range(volume.shape[3]):
+                    volume[n, place, row, column] = torch.nn.functional.cosine_similarity(
+                        query[n, :, row, column], goal, dim=0)
+    x = torch.relu(encoder.fuse(torch.cat([seen, encoder.SCALE * volume], dim=1)))
+    for block in encoder.stage:
+        x = block(x)
+    assert torch.allclose(x, encoder.meet(seen, goals, None)[0], atol=1e-5)
+    swapped = encoder.meet(seen, goals, torch.tensor([1, 0]))[0]
+    assert torch.equal(swapped, encoder.meet(seen, goals[[1, 0]], None)[0])
 
 
 def test_stacked_frames_equal_a_naive_loop():
@@ -399,7 +424,9 @@ def test_bfloat16_stays_close_to_float32(architecture, frames):
         rounded = outputs[torch.bfloat16][name]
         assert rounded.dtype == torch.float32, name
         error = float((rounded - exact).detach().abs().max())
-        assert 0 < error < 0.03 * float(exact.detach().abs().max()) + 0.003, name
+        # Similarities of noise are small differences of products.
+        share = 0.06 if architecture == 'matching' else 0.03
+        assert 0 < error < share * float(exact.detach().abs().max()) + 0.003, name
 
 
 @pytest.mark.parametrize('architecture', OURS)

@@ -47,14 +47,55 @@ def test_shapes_and_mixture(sampler):
         assert pairs[name].shape == (600, *shape) and pairs[name].dtype == kind, name
     distance = np.hypot(*pairs['goal_pose'][:, :2].T)
     turn = np.abs(np.arctan2(pairs['goal_pose'][:, 3], pairs['goal_pose'][:, 2]))
-    near = (distance <= 4.0) & (turn <= np.radians(75.1))
-    assert 0.75 <= near.mean() <= 0.9 and turn.max() > 3.0
+    assert 0.8 <= (distance <= 4.0).mean() <= 0.95 and turn.max() > 3.0
+    far = distance > 1.5  # and some of the goal in view: what a robot sees that enters a room
+    assert (far & (pairs['overlap'] >= 0.1)).mean() > 0.12
     assert 0.05 <= pairs['arrived'].mean() <= 0.3
     assert set(pairs['house']) == {0, 1}
     assert (pairs['overlap'][pairs['arrived']] > 0.05).mean() > 0.9
     assert (pairs['overlap'] >= 0).all() and (pairs['overlap'] <= 1).all()
     with pytest.raises(UserError, match='at least one pair'):
         sampler.draw(0)
+
+
+def test_groups_hold_the_pairs_both_ways_round(sampler):
+    sampler.count = 10
+    pairs = sampler.draw(8)
+    sampler.count = 10
+    groups = sampler.draw_groups(8, robots=1)
+    assert sampler.count == 18
+    forth = groups['second'] % 2 == 0  # the goal is the first view of each group
+    assert forth.sum() == 8 and len(forth) == 16
+    for name in ('goal_pose', 'overlap'):
+        assert np.array_equal(groups[name][forth], pairs[name]), name
+    for name, own in (('image', 'image'), ('depth', 'depth'), ('segmentation', 'segmentation')):
+        assert np.array_equal(groups[own][groups['first'][forth]], pairs[name]), name
+    assert np.array_equal(groups['image'][groups['second'][forth]], pairs['goal'])
+    # The way back: turned by the opposite angle, as far away.
+    to, back = groups['goal_pose'][forth], groups['goal_pose'][~forth]
+    assert np.allclose(np.hypot(*to[:, :2].T), np.hypot(*back[:, :2].T), atol=1e-5)
+    assert np.allclose(to[:, 2], back[:, 2]) and np.allclose(to[:, 3], -back[:, 3])
+
+
+def test_groups_share_a_goal_and_their_labels_are_those_of_the_environment(sampler):
+    sampler.count = 0
+    groups = sampler.draw_groups(5, robots=3)
+    assert sampler.count == 15 and groups['image'].shape == (20, 3, 36, 36)
+    assert len(groups['first']) == 5 * 4 * 3
+    assert (groups['first'] // 4 == groups['second'] // 4).all()
+    assert len(set(zip(groups['first'], groups['second'], strict=True))) == 60
+    # Robot to robot is robot to goal and goal to robot, one after the other.
+    at = {pair: k for k, pair in enumerate(zip(groups['first'], groups['second'], strict=True))}
+    for group in range(5):
+        goal, one, other = 4 * group, 4 * group + 1, 4 * group + 3
+        first, second, whole = (groups['goal_pose'][at[pair]] for pair in (
+            (one, goal), (goal, other), (one, other)))
+        turned = complex(*first[2:]) * complex(*second[:2])
+        assert np.allclose(first[:2] + [turned.real, turned.imag], whole[:2], atol=1e-4)
+        assert np.isclose(complex(*first[2:]) * complex(*second[2:]), complex(*whole[2:]),
+                          atol=1e-4)
+    with pytest.raises(UserError, match='at least one group'):
+        sampler.draw_groups(4, 0)
 
 
 def test_robots_stand_where_robots_can_stand(sampler):

@@ -217,7 +217,8 @@ def _load(path: Path, robot: Path | None = None):
     from vn_sim_bridge.world import WORLD_VERSION
     checkpoint = load_checkpoint(path)
     spec = load_robot(robot) if robot else RobotSpec()
-    spec.with_actions(checkpoint.config.actions)  # or says which action is unknown
+    # Or says which action is unknown, or too long.
+    spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
     present = math.degrees(spec.camera_fov), spec.camera_height
     if any(abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):

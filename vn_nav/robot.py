@@ -97,11 +97,21 @@ class RobotSpec:
         """The names in table order; an action's index is its place here."""
         return tuple(action.name for action in self.actions)
 
-    def with_actions(self, names: tuple[str, ...] | list[str]) -> RobotSpec:
+    @property
+    def moves(self) -> tuple[tuple[float, float, float], ...]:
+        """What each action does to the base: dx, dy [m], dyaw [rad]."""
+        return tuple((action.dx, action.dy, action.dyaw) for action in self.actions)
+
+    def with_actions(self, names: tuple[str, ...] | list[str],
+                     moves: tuple[tuple[float, float, float], ...] = ()) -> RobotSpec:
         """The same robot with only the named actions, in the given order.
 
+        Args:
+            names: of the actions.
+            moves: dx, dy, dyaw that a policy expects of them; empty: it does not care.
+
         Raises:
-            UserError: a name that this robot does not have.
+            UserError: a name that this robot does not have, or an action of another size.
         """
         table = {action.name: action for action in self.actions}
         for name in names:
@@ -109,7 +119,15 @@ class RobotSpec:
                 raise UserError(f'every action of the policy exists on robot {self.name!r}', name,
                                 f'its actions are {", ".join(table)}: use another robot file or '
                                 'another checkpoint')
-        return dataclasses.replace(self, actions=tuple(table[name] for name in names))
+        chosen = dataclasses.replace(self, actions=tuple(table[name] for name in names))
+        for name, expected, own in zip(names, moves, chosen.moves, strict=bool(moves)):
+            if not all(math.isclose(a, b, abs_tol=1e-4)
+                       for a, b in zip(expected, own, strict=True)):
+                raise UserError(f'the policy knows how far {name} moves the robot: '
+                                f'{expected} (m, m, rad)', f'{own} on robot {self.name!r}',
+                                'use a robot file with that action, or train a policy for this '
+                                'robot')
+        return chosen
 
     def max_velocity(self, axis: str) -> float:
         """Speed limit [m/s or rad/s] along an axis of `AXES`."""

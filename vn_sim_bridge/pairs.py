@@ -20,8 +20,13 @@ from vn_sim_bridge.overlap import lift, overlap, relative_pose
 from vn_sim_bridge.randomisation import Randomisation
 
 # How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.
-NEARBY = (0.60, 4.0, math.radians(75))
-CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these; the rest stands anywhere
+NEARBY = (0.30, 4.0, math.radians(75))
+CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
+# With the goal before them: pairs that overlap are seldom farther than a metre apart otherwise, and
+# a robot that comes into a room sees its goal from afar. The heading is that to the goal; the last
+# angle is the direction from the goal, off that from where the goal picture would show the robot's
+# back. The rest stands anywhere.
+BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
 GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
 TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
 WINDOW = 12  # cells around a goal that a path of the arrival radius cannot leave
@@ -31,8 +36,8 @@ class PairSampler:
     """Independent random pairs of views in some houses.
 
     A goal stands on a random free cell, with free floor straight ahead. A robot stands near it
-    (`NEARBY`, `CLOSE`: uniform in distance, direction and heading, where it touches nothing) or
-    anywhere in its house. Light and camera of the two are drawn apart. Everything is a function of
+    (`NEARBY`, `CLOSE`, `BEHIND`: uniform in distance, direction and heading, where it touches
+    nothing) or anywhere in its house. Light and camera of the two are drawn apart. Everything is a function of
     the seed and the number of the draw: to go on later, keep `count` and set it again.
 
     Args:
@@ -98,9 +103,55 @@ class PairSampler:
             'house': house, 'pose': poses, 'goal_place': goal_poses,
         }
 
-    def poses(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Houses [K] and poses [K,4] of robots and of goals, of some draws [K]."""
+    def draw_groups(self, count: int, robots: int = 3) -> dict[str, np.ndarray]:
+        """Views in groups, each of a goal and of several robots that stand about it as in a pair.
+
+        Any two views of a group are a pair, either way round: more labels for each picture.
+
+        Args:
+            count: groups; robots: R in each.
+
+        Returns:
+            image: [V,3,S,S] uint8 of V = count * (1 + R) views, a goal before its robots.
+            depth: [V,S,S] float32 m; segmentation: [V,S,S] uint8.
+            first, second: [K] int64, views of the K = count * (1 + R) * R pairs; the second is
+                the goal.
+            goal_pose: [K,4], overlap: [K], of the pairs, as `draw` returns them.
+        """
+        if count < 1 or robots < 1:
+            raise UserError('a draw has at least one group, and that one robot', (count, robots),
+                            'draw more')
+        # The numbers of the draws go on over all robots, whatever a group's size.
+        numbers = np.arange(self.count, self.count + count * robots)
+        house, poses, goal_poses = self.poses(numbers, robots)
+        self.count += count * robots
+        size = 1 + robots
+        poses = np.concatenate([goal_poses[::robots, None], poses.reshape(count, robots, 4)], 1)
+        numbers = np.concatenate([numbers[::robots, None], numbers.reshape(count, robots)], 1)
+        views = np.tile(np.arange(size) == 0, count)  # as in `draw`: a goal is 1, a robot 0
+        poses, numbers = poses.reshape(-1, 4), numbers.reshape(-1)
+        frames, (cameras, fov) = self._look(np.repeat(house[::robots], size), poses, numbers,
+                                            views.astype(np.int64))
+        points = lift(frames.depth, cameras, fov)
+        first, second = np.nonzero(~np.eye(size, dtype=bool))
+        start = size * np.arange(count)[:, None]
+        first, second = (start + first).reshape(-1), (start + second).reshape(-1)
+        return {
+            'image': frames.rgb, 'depth': frames.depth, 'segmentation': frames.labels,
+            'first': first, 'second': second,
+            'goal_pose': relative_pose(poses[first], poses[second]),
+            'overlap': overlap(points[second], frames.depth[first], cameras[first], fov[first]),
+        }
+
+    def poses(self, numbers: np.ndarray, robots: int = 1
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Houses [K] and poses [K,4] of robots and of goals, of some draws [K].
+
+        With several `robots` as many rows in a row have the goal of their first one.
+        """
         draws = uniform(self._seed, Stream.PAIR, numbers[:, None], 0, np.arange(3 + 5 * TRIES))
+        leader = np.arange(len(numbers)) // robots * robots
+        draws[:, 0], draws[:, 3:3 + 2 * TRIES] = draws[leader, 0], draws[leader, 3:3 + 2 * TRIES]
         house = (draws[:, 0] * len(self.houses)).astype(np.int64)
         poses, goal_poses = np.zeros((2, len(numbers), 4))
         _place(draws, house, *self._floors, poses, goal_poses)
@@ -177,7 +228,8 @@ def _place(draws, houses, cells, first_cell, rects, first_rect, free, origins, r
         rest = rest[2 * TRIES:]
         pose = poses[k]
         kind = draws[k, 1]
-        if kind >= NEARBY[0] + CLOSE[0]:
+        behind = NEARBY[0] + CLOSE[0] <= kind < NEARBY[0] + CLOSE[0] + BEHIND[0]
+        if kind >= NEARBY[0] + CLOSE[0] + BEHIND[0]:
             # Off the centre of its cell: robots stop anywhere.
             for attempt in range(TRIES):
                 cell = low + int(rest[3 * attempt] * count)
@@ -187,14 +239,22 @@ def _place(draws, houses, cells, first_cell, rects, first_rect, free, origins, r
                     break
             pose[2] = (2 * draws[k, 2] - 1) * math.pi
             continue
-        farthest, turn = (NEARBY[1], NEARBY[2]) if kind < NEARBY[0] else (CLOSE[1], CLOSE[2])
+        farthest, turn = BEHIND[1], BEHIND[2]
+        if not behind:
+            farthest, turn = (NEARBY[1], NEARBY[2]) if kind < NEARBY[0] else (CLOSE[1], CLOSE[2])
         pose[0], pose[1] = goal[0], goal[1]
         for attempt in range(TRIES):
             distance = farthest * rest[3 * attempt]
             angle = 2 * math.pi * rest[3 * attempt + 1]
+            if behind:
+                distance = farthest * math.sqrt(rest[3 * attempt])  # more of the far ones
+                angle = goal[2] + math.pi + BEHIND[3] * (angle / math.pi - 1)
             x, y = goal[0] + distance * math.cos(angle), goal[1] + distance * math.sin(angle)
             if _fits(x, y, house, rects, first_rect, free, origins, radius):
                 pose[0], pose[1] = x, y
                 break
-        yaw = goal[2] + (2 * draws[k, 2] - 1) * turn
+        yaw = goal[2]
+        if behind and (pose[0] != goal[0] or pose[1] != goal[1]):
+            yaw = math.atan2(goal[1] - pose[1], goal[0] - pose[0])
+        yaw += (2 * draws[k, 2] - 1) * turn
         pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi

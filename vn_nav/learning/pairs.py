@@ -34,10 +34,13 @@ COLUMNS = ('pairs', 'minutes', 'loss', 'bearing_deg', 'bearing_within_30', 'head
 class PairSource(Protocol):
     """Draws pairs; `vn_sim_bridge.pairs.PairSampler` does."""
 
-    count: int  # pairs drawn so far; may be set
+    count: int  # robots placed so far; may be set
 
     def draw(self, count: int) -> dict[str, np.ndarray]:
         """`image` and `goal` [K,3,S,S] uint8, `goal_pose` [K,4], `overlap` [K]."""
+
+    def draw_groups(self, count: int, robots: int) -> dict[str, np.ndarray]:
+        """`image` [V,3,S,S] uint8 and pairs of them: `first`, `second` [K], and the same labels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +48,8 @@ class PairConfig:
     """Numbers of the pre-training."""
 
     minutes: float = 10.0  # wall-clock, drawing included
-    batch: int = 128
+    groups: int = 64  # of views, in a step
+    robots: int = 1  # in a group, beside the goal; R make R * (R + 1) pairs
     learning_rate: float = 1e-3  # at the start; falls linearly to a twentieth
     report_every: int = 200  # steps
     image_weight: float = 0.5  # of the image heads, where the network has some
@@ -87,13 +91,12 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
         share = min(seconds / 60 / config.minutes, 1.0)
         for group in optimiser.param_groups:
             group['lr'] = config.learning_rate * (1 - 0.95 * share)
-        pairs = source.draw(config.batch)
-        pose, maps = _look(network, pairs)
-        loss = pose_loss(*pose, torch.from_numpy(pairs['goal_pose']),
-                         torch.from_numpy(pairs['overlap']), torch.ones(config.batch) > 0)
+        pairs = source.draw_groups(config.groups, config.robots)
+        pose, maps = _look(network, pairs['image'], pairs['first'], pairs['second'])
+        overlap = torch.from_numpy(pairs['overlap'])
+        loss = pose_loss(*pose, torch.from_numpy(pairs['goal_pose']), overlap, overlap >= 0)
         for name in drawn:
-            shown = torch.from_numpy(pairs['image' if name == 'reconstruction' else name])
-            error = network.heads[name](maps) - image_target(network, name, shown)
+            error = network.heads[name](maps) - _shown(network, name, pairs)
             loss = loss + config.image_weight * (error ** 2).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -103,7 +106,7 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
         now = time.monotonic()
         seconds, clock = seconds + now - clock, now
         if len(losses) == config.report_every or seconds >= 60 * config.minutes:
-            row = {'pairs': source.count, 'minutes': seconds / 60,
+            row = {'pairs': source.count * (1 + config.robots), 'minutes': seconds / 60,
                    'loss': float(torch.stack(losses).mean()), **errors(pose, pairs),
                    **{f'validation_{name}': value
                       for name, value in measure(network, held_out).items()}}
@@ -124,8 +127,11 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
 @torch.no_grad()
 def measure(network: Policy, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     """`errors` of a network on some pairs."""
-    poses = [_look(network, {name: rows[k:k + 128] for name, rows in pairs.items()})[0]
-             for k in range(0, len(pairs['image']), 128)]
+    poses = []
+    for k in range(0, len(pairs['image']), 128):
+        views = np.concatenate([pairs['image'][k:k + 128], pairs['goal'][k:k + 128]])
+        first = np.arange(len(views) // 2)
+        poses.append(_look(network, views, first, first + len(first))[0])
     return errors(Pose(*(torch.cat(parts) for parts in zip(*poses, strict=True))), pairs)
 
 
@@ -146,10 +152,22 @@ def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     }
 
 
-def _look(network: Policy, pairs: dict[str, np.ndarray]) -> tuple[Pose, Tensor]:
-    goals = network.encode_goals(torch.from_numpy(pairs['goal']))
-    maps, features = network.encode(torch.from_numpy(pairs['image']), goals, None)
+def _look(network: Policy, views: np.ndarray, first: np.ndarray, second: np.ndarray
+          ) -> tuple[Pose, Tensor]:
+    """What the network says of pairs of views, and its maps: every view is encoded once."""
+    shown = torch.from_numpy(views)
+    goals = network.encode_goals(shown)
+    seen = network.encoder.see(shown, network.compute_dtype)
+    maps, features = network.encoder.meet(seen[first], goals[second], None)
     return network.heads['goal_pose'](features), maps
+
+
+def _shown(network: Policy, name: str, pairs: dict[str, np.ndarray]) -> Tensor:
+    """What an image head shall draw of pairs."""
+    key, view = {'reconstruction': ('image', 'first'), 'depth': ('depth', 'first'),
+                 'segmentation': ('segmentation', 'first'),
+                 'goal_segmentation': ('segmentation', 'second')}[name]
+    return image_target(network, name, torch.from_numpy(pairs[key]))[pairs[view]]
 
 
 def _angle(one: Tensor, other: Tensor) -> Tensor:

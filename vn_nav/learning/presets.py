@@ -41,6 +41,7 @@ class TrainConfig(LearnerConfig):
     stacked_frames: int = 1
     deconvolutions: int | None = None  # None: one below `LARGE` pixels, else two (table 5.1)
     pose_to_memory: bool = False
+    track_goal: bool = False  # by dead reckoning, see `vn_nav.policy.memory.GoalTracker`
     # Of icra2017: the file with the weights of ResNet-50 (without one: the small random encoder),
     # and the scenes with layers of their own (house i of the environment is scene i).
     frozen_weights: str = ''
@@ -92,14 +93,21 @@ class TrainConfig(LearnerConfig):
             if not kept:
                 raise UserError(rule, received, 'correct the training configuration')
 
-    def network(self, actions: tuple[str, ...], size: int) -> NetworkConfig:
-        """The network for a robot's actions and a picture size, with the heads of the tasks."""
+    def network(self, actions: tuple[str, ...], size: int,
+                moves: tuple[tuple[float, float, float], ...] = ()) -> NetworkConfig:
+        """The network for a robot's actions and a picture size, with the heads of the tasks.
+
+        Args:
+            actions: names; size: side of the pictures [pixels].
+            moves: what the actions do, see `NetworkConfig.moves`; for `track_goal` alone.
+        """
         deconvolutions = self.deconvolutions or (1 if size < LARGE else 2)
         return NetworkConfig(
             actions=actions, size=size, architecture=self.architecture, channels=self.channels,
             blocks=self.blocks, features=self.features, hidden=self.hidden,
             frames=self.stacked_frames, heads=self.heads, deconvolutions=deconvolutions,
-            pose_to_memory=self.pose_to_memory, pixel_mean=self.pixel_mean,
+            pose_to_memory=self.pose_to_memory, moves=moves if self.track_goal else (),
+            pixel_mean=self.pixel_mean,
             pixel_std=self.pixel_std, frozen='resnet50' if self.frozen_weights else '',
             scenes=self.scenes)
 

@@ -135,7 +135,8 @@ class _Training:
         size = env.goals.shape[-1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = Policy(config.network(tuple(env.action_names), size))
+            self.network = Policy(config.network(tuple(env.action_names), size,
+                                                 env.robot.moves if config.track_goal else ()))
         if config.frozen_weights:
             load_frozen_weights(self.network.encoder.frozen, config.frozen_weights)
         self.network.to(config.device)

@@ -91,7 +91,7 @@ class PolicyNode(LifecycleNode):
         runtime = PolicyRuntime(value['checkpoint'] or share_file('models/house'),
                                 seed=value['seed'], decoding=value['decoding'] or None,
                                 stop_threshold=None if threshold < 0 else threshold)
-        robot = robot.with_actions(runtime.action_names)
+        robot = robot.with_actions(runtime.action_names, runtime.moves)
         if self.lock_step:
             limits = Limits(frame_timeout=LOCK_STEP_LIMIT, frame_stop_timeout=LOCK_STEP_LIMIT,
                             inference_timeout=LOCK_STEP_LIMIT, settle_time=0.0)

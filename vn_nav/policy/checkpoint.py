@@ -242,10 +242,15 @@ def _describe(network: dict) -> str:
                 f'frames; layers for {network["scenes"]} scene{"s" * (network["scenes"] > 1)}')
     words = {'thesis': "the thesis's two streams", 'unreal': "UNREAL's single stream",
              'fused': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
-                      f'goal fused in the first; {network["features"]} features'}[
+                      f'goal fused in the first; {network["features"]} features',
+             'matching': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
+                         'goal compared place by place (correlation volume); '
+                         f'{network["features"]} features'}[
         network['architecture']]
     if network['blocks']:
         words += f'; {network["blocks"]} residual block(s) a stage'
+    if network.get('moves'):
+        words += '; the goal tracked by dead reckoning'
     words += (f'; {network["frames"]} stacked frames' if network['frames'] > 1
               else f'; LSTM {network["hidden"]}')
     heads = ', '.join(network['heads']).replace('_', ' ')

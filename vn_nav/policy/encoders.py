@@ -128,8 +128,16 @@ class Fused(nn.Module):
     def forward(self, image: Tensor, goal_maps: Tensor, goal_index: Tensor | None,
                 dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Maps [N,C,h,w] and features [N,F]."""
-        maps = self.first(image, dtype, slice(0, self.planes)).permute(0, 2, 3, 1)
-        x = add_goals(maps, goal_maps.permute(0, 2, 3, 1), goal_index)
+        return self.meet(self.see(image, dtype), goal_maps, goal_index)
+
+    def see(self, image: Tensor, dtype: torch.dtype) -> Tensor:
+        """The pictures' share of the first convolution, [N,C,h,w]."""
+        return self.first(image, dtype, slice(0, self.planes))
+
+    def meet(self, seen: Tensor, goal_maps: Tensor, goal_index: Tensor | None
+             ) -> tuple[Tensor, Tensor]:
+        """Maps and features, as `forward`, of what `see` returned."""
+        x = add_goals(seen.permute(0, 2, 3, 1), goal_maps.permute(0, 2, 3, 1), goal_index)
         x = F.relu(x).permute(0, 3, 1, 2)
         for block in self.stage1:
             x = block(x)
@@ -152,6 +160,76 @@ class ResidualBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[N,C,h,w] -> the same shape."""
         return F.relu(x + apply(self.conv2, F.relu(apply(self.conv1, x))))
+
+
+def _directions(maps: Tensor) -> Tensor:
+    """Maps [N,C,h,w] of length 1 along C; the lengths in float32, for bfloat16 is too coarse."""
+    return F.normalize(maps.float(), dim=1).to(maps.dtype)
+
+
+class Matching(nn.Module):
+    """Shared convolutions, then which place of the picture looks like which place of the goal.
+
+    Both pictures pass convolutions 8x8/4 and 3x3/2 (padded). The correlation volume (all cosine
+    similarities of a place of the picture and one of the goal; Rocco et al., arXiv 1703.05593)
+    joins the picture's maps, one channel a place of the goal; a 1x1 convolution, `blocks`
+    residual blocks, of one at least, and a linear layer read it. 64 pixels give maps of side 8.
+
+    Stacking the pictures compares places that lie nearby in both; this one any two: it learns
+    goal poses from far fewer pairs (docs/results.md).
+
+    Args:
+        as of `Fused`; blocks: after the pictures have met.
+    """
+
+    SCALE = 3.0  # of similarities in [-1, 1], beside maps of about that size
+
+    def __init__(self, size: int, channels: tuple[int, int, int], features: int, blocks: int,
+                 mean: float, std: float, frames: int = 1):
+        super().__init__()
+        first, second, third = channels
+        self.first = Pixels(3 * frames, first, 8, 4, mean, std)
+        self.conv2 = nn.Conv2d(first, second, 3, 2, 1)
+        side = ((size - 8) // 4 + 2) // 2
+        self.query = nn.Conv2d(second, second, 1)
+        self.key = nn.Conv2d(second, second, 1)
+        self.fuse = nn.Conv2d(second + side**2, third, 1)
+        self.stage = nn.ModuleList(ResidualBlock(third) for _ in range(max(blocks, 1)))
+        self.maps = (third, side)
+        self.trunk = nn.Linear(third * side**2, features)
+        self.features = features
+        orthogonal(self)
+        for block in self.stage:
+            nn.init.zeros_(block.conv2.weight)  # begins as the identity
+        self.to(memory_format=torch.channels_last)
+
+    def see(self, image: Tensor, dtype: torch.dtype) -> Tensor:
+        """Maps of a picture alone, [N,C,h,w]."""
+        return F.relu(apply(self.conv2, F.relu(self.first(image, dtype))))
+
+    def encode_goals(self, goals: Tensor, dtype: torch.dtype) -> Tensor:
+        """What places of the goals look like, [G,C,h,w] of length 1 along C."""
+        return _directions(apply(self.key, self.see(goals, dtype)))
+
+    def forward(self, image: Tensor, goal_maps: Tensor, goal_index: Tensor | None,
+                dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Maps [N,C,h,w] and features [N,F]."""
+        return self.meet(self.see(image, dtype), goal_maps, goal_index)
+
+    def meet(self, seen: Tensor, goal_maps: Tensor, goal_index: Tensor | None
+             ) -> tuple[Tensor, Tensor]:
+        """Maps and features, as `forward`, of what `see` returned."""
+        if goal_index is not None:
+            goal_maps = goal_maps.index_select(0, goal_index)
+        query = _directions(apply(self.query, seen))
+        # [N,places,C] x [N,C,places of the goal]: the maps lie in memory as the left one.
+        volume = self.SCALE * torch.bmm(
+            query.permute(0, 2, 3, 1).flatten(1, 2), goal_maps.flatten(2))
+        rows = torch.cat([seen.permute(0, 2, 3, 1), volume.unflatten(1, seen.shape[2:])], dim=3)
+        x = F.relu(apply(self.fuse, rows.permute(0, 3, 1, 2)))
+        for block in self.stage:
+            x = block(x)
+        return x, F.relu(apply(self.trunk, x.permute(0, 2, 3, 1).flatten(1)))
 
 
 class TwoStreams(nn.Module):

@@ -14,6 +14,7 @@ from vn_nav.policy.encoders import apply, uniform_by_fan_in
 class RecurrentState(NamedTuple):
     """Memory between calls: hidden and cell of the LSTM, [B,H] each.
 
+    A policy that tracks the goal (`GoalTracker`) keeps its estimate in further columns of `hidden`.
     A policy on stacked frames keeps its last pictures in `hidden` ([B,K-1,3,S,S] uint8) instead,
     or their frozen features ([B,K-1,F] float32), and nothing in `cell` ([B,0]).
     """
@@ -108,6 +109,66 @@ class MaskedLSTM(nn.Module):
         cell = torch.sigmoid(i) * torch.tanh(g) + torch.sigmoid(f) * (state.cell * keep[0])
         hidden = torch.sigmoid(o) * torch.tanh(cell)
         return hidden.unsqueeze(0), RecurrentState(hidden, cell)
+
+
+class GoalTracker(nn.Module):
+    """Where the goal stands relative to the robot, carried along while it is out of sight.
+
+    A filter without weights to learn: each action moves the estimate by what the robot was told to
+    do (dead reckoning), and each look at the goal corrects it by its confidence against that of
+    the estimate, which fades with every move. The memory sees the estimate.
+
+    Args:
+        moves: [A,3] of the actions: dx forward, dy left [m], dyaw [rad].
+    """
+
+    WIDTH = 5  # numbers of the estimate: x, y [m], cos and sin of the heading, weight
+    FADE = 0.95  # of the weight, each action
+    MOST = 100.0  # the weight of an estimate
+
+    def __init__(self, moves: tuple[tuple[float, float, float], ...]):
+        super().__init__()
+        table = torch.tensor([*moves, (0.0, 0.0, 0.0)])  # the last row: no action yet
+        self.register_buffer('shift', table[:, :2].contiguous(), persistent=False)
+        self.register_buffer('turn', torch.stack([table[:, 2].cos(), table[:, 2].sin()], dim=1),
+                             persistent=False)
+
+    @torch.no_grad()
+    def forward(self, position: Tensor, heading: Tensor, overlap: Tensor, last_action: Tensor,
+                starts: Tensor, estimate: Tensor) -> tuple[Tensor, Tensor]:
+        """Track through T steps.
+
+        Args:
+            position: [T,B,2] m; heading: [T,B,2]; overlap: [T,B] logit: see `heads.Pose`.
+            last_action: [T,B], -1 where there is none; starts: [T,B] bool.
+            estimate: [B,5] before the first row.
+
+        Returns:
+            [T,B,5] what the memory sees, within about [-2, 2] and vanishing with the confidence;
+            and the estimate [B,5] after the last row.
+        """
+        shift, turn = self.shift[last_action], self.turn[last_action]
+        # The square of the odds: a hundred doubtful looks do not make a goal.
+        weight = (2 * overlap.clamp(-4.0, 2.3)).exp().unsqueeze(2)
+        look = torch.cat([position, heading], dim=2)
+        keep = self.FADE * (~starts).unsqueeze(2)
+        rows = []
+        for t in range(len(starts)):
+            c, s = turn[t, :, 0], turn[t, :, 1]
+            x, y = (estimate[:, :2] - shift[t]).unbind(1)
+            cos, sin = estimate[:, 2], estimate[:, 3]
+            moved = torch.stack([c * x + s * y, c * y - s * x, c * cos + s * sin,
+                                 c * sin - s * cos], dim=1)
+            before = keep[t] * estimate[:, 4:]
+            total = (before + weight[t]).clamp(max=self.MOST)
+            gain = weight[t] / (before + weight[t])
+            estimate = torch.cat([moved + gain * (look[t] - moved), total], dim=1)
+            rows.append(estimate)
+        track = torch.stack(rows)
+        sure = track[..., 4:] / (1 + track[..., 4:])
+        seen = torch.cat([sure * (track[..., :2] / 3.0).clamp(-2.0, 2.0),
+                          sure * track[..., 2:4].clamp(-1.0, 1.0), sure], dim=2)
+        return seen, estimate
 
 
 class _Recurrence(torch.autograd.Function):

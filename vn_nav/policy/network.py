@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.encoders import Fused, OneStream, TwoStreams
+from vn_nav.policy.encoders import Fused, Matching, OneStream, TwoStreams
 from vn_nav.policy.heads import (
     GoalPose,
     ImageHead,
@@ -24,10 +24,16 @@ from vn_nav.policy.heads import (
     Scalar,
     grown,
 )
-from vn_nav.policy.memory import Feedforward, MaskedLSTM, RecurrentState, stack_frames
+from vn_nav.policy.memory import (
+    Feedforward,
+    GoalTracker,
+    MaskedLSTM,
+    RecurrentState,
+    stack_frames,
+)
 from vn_nav.policy.zhu import FROZEN, SceneLinear, Siamese
 
-ARCHITECTURES = ('fused', 'thesis', 'unreal', 'icra2017')
+ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
 # Channels that each image head draws, and the width of its inner maps. The thesis says that depth
 # has "only" 32, so the segmentation heads are wider.
 IMAGE_HEADS = {'depth': (1, 32), 'segmentation': (3, 64), 'goal_segmentation': (3, 64),
@@ -53,6 +59,9 @@ class NetworkConfig:
     heads: tuple[str, ...] = ()  # of HEADS
     deconvolutions: int = 1  # of pixel control and image heads: 84 px give 20 x 20, or 42 x 42
     pose_to_memory: bool = False  # the memory also sees what the head goal_pose says
+    # [A,3] dx, dy [m], dyaw [rad] of the actions: with them the memory also sees where the goal
+    # stands by dead reckoning since it was seen, see `GoalTracker`. Empty: it does not.
+    moves: tuple[tuple[float, float, float], ...] = ()
     # Grey levels. Standardised input is what made learning work; whole numbers up to 256 less a
     # whole mean stay exact in bfloat16.
     pixel_mean: float = 120.0
@@ -64,6 +73,7 @@ class NetworkConfig:
     def __post_init__(self):
         for name in ('actions', 'channels', 'heads'):
             object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, 'moves', tuple(map(tuple, self.moves)))
         rules = (
             (len(self.actions) >= 2 and len(set(self.actions)) == len(self.actions),
              'a policy has at least two actions with distinct names', self.actions),
@@ -83,6 +93,11 @@ class NetworkConfig:
              self.deconvolutions),
             (not self.pose_to_memory or 'goal_pose' in self.heads,
              'pose_to_memory needs the head goal_pose', self.heads),
+            (not self.moves or (self.pose_to_memory and self.frames == 1),
+             'a goal is tracked by a network with pose_to_memory and an LSTM', self.heads),
+            (not self.moves or (len(self.moves) == len(self.actions)
+                                and all(len(move) == 3 for move in self.moves)),
+             'there is a move (dx, dy, dyaw) for each action', self.moves),
             (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
             (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
              'one', self.frozen),
@@ -135,15 +150,18 @@ class Policy(nn.Module):
             self._build_scenes()
             return
         pixels = {'mean': config.pixel_mean, 'std': config.pixel_std, 'frames': config.frames}
-        if config.architecture == 'fused':
-            self.encoder = Fused(config.size, config.channels, config.features, config.blocks,
-                                 **pixels)
+        own = {'fused': Fused, 'matching': Matching}.get(config.architecture)
+        if own is not None:
+            self.encoder = own(config.size, config.channels, config.features, config.blocks,
+                               **pixels)
         else:
             encoder = {'thesis': TwoStreams, 'unreal': OneStream}[config.architecture]
             self.encoder = encoder(config.size, **pixels)
         inputs = (self.encoder.features + len(config.actions) + 1
-                  + (5 if config.pose_to_memory else 0))
-        thesis = config.architecture != 'fused'
+                  + (5 if config.pose_to_memory else 0)
+                  + (GoalTracker.WIDTH if config.moves else 0))
+        self.tracker = GoalTracker(config.moves) if config.moves else None
+        thesis = own is None
         if config.frames > 1:
             self.memory = Feedforward(inputs, config.hidden)
         else:
@@ -200,7 +218,8 @@ class Policy(nn.Module):
                                      device=self.device)
             return RecurrentState(before, torch.zeros(batch, 0, device=self.device))
         zeros = torch.zeros(batch, config.hidden, device=self.device)
-        return RecurrentState(zeros, zeros.clone())
+        tracked = torch.zeros(batch, GoalTracker.WIDTH if config.moves else 0, device=self.device)
+        return RecurrentState(torch.cat([zeros, tracked], dim=1), zeros.clone())
 
     @property
     def device(self) -> torch.device:
@@ -269,7 +288,17 @@ class Policy(nn.Module):
             pose = self.heads['goal_pose'](features)
             if self.config.pose_to_memory:
                 inputs.append(_compass(pose).view(steps, batch, -1).to(dtype))
-        hidden, state = self.memory(torch.cat(inputs, dim=-1), starts, state)
+        if self.tracker is not None:
+            own = self.config.hidden
+            seen, estimate = self.tracker(
+                *(part.detach().view(steps, batch, *part.shape[1:]) for part in pose),
+                obs.last_action, starts, state.hidden[:, own:])
+            inputs.append(seen.to(dtype))
+            hidden, state = self.memory(torch.cat(inputs, dim=-1), starts,
+                                        RecurrentState(state.hidden[:, :own], state.cell))
+            state = RecurrentState(torch.cat([state.hidden, estimate], dim=1), state.cell)
+        else:
+            hidden, state = self.memory(torch.cat(inputs, dim=-1), starts, state)
         return Latents(maps, features, hidden, pose), state
 
     def maps(self, obs: Observation, starts: Tensor | None = None) -> Tensor:

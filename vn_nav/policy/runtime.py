@@ -42,6 +42,7 @@ class PolicyRuntime:
     Attributes:
         size: side of the square pictures [pixels].
         action_names: an action's number is its place here.
+        moves: what the actions do to the robot, if the policy counts on it; else empty.
         camera_fov: field of view that the pictures have [rad].
         info: what else the checkpoint says.
         stop_threshold: the one in force; None: the policy declares nothing.
@@ -65,6 +66,7 @@ class PolicyRuntime:
         torch.set_num_threads(1)
         self.size: int = checkpoint.config.size
         self.action_names: tuple[str, ...] = checkpoint.config.actions
+        self.moves: tuple[tuple[float, float, float], ...] = checkpoint.config.moves
         self.camera_fov: float = math.radians(checkpoint.info['camera_fov_deg'])
         self.info: dict = checkpoint.info
         self._network = checkpoint.network
