@@ -22,10 +22,9 @@ from vn_sim_bridge.randomisation import Randomisation
 # How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.
 NEARBY = (0.30, 4.0, math.radians(75))
 CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
-# With the goal before them: pairs that overlap are seldom farther than a metre apart otherwise, and
-# a robot that comes into a room sees its goal from afar. The heading is that to the goal; the last
-# angle is the direction from the goal, off that from where the goal picture would show the robot's
-# back. The rest stands anywhere.
+# With the goal ahead: pairs that overlap are seldom farther than a metre apart otherwise, and a
+# robot that comes into a room sees its goal from afar. The heading is off that to the goal; the
+# last angle is that of the robot's place off the line behind the goal. The rest stands anywhere.
 BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
 GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
 TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
@@ -36,9 +35,9 @@ class PairSampler:
     """Independent random pairs of views in some houses.
 
     A goal stands on a random free cell, with free floor straight ahead. A robot stands near it
-    (`NEARBY`, `CLOSE`, `BEHIND`: uniform in distance, direction and heading, where it touches
-    nothing) or anywhere in its house. Light and camera of the two are drawn apart. Everything is a function of
-    the seed and the number of the draw: to go on later, keep `count` and set it again.
+    (`NEARBY`, `CLOSE`, `BEHIND`: where it touches nothing) or anywhere in its house. Light and
+    camera of the two are drawn apart. Everything is a function of the seed and the number of the
+    draw: to go on later, keep `count` and set it again.
 
     Args:
         houses: seeds.

@@ -40,7 +40,7 @@ class PairSource(Protocol):
         """`image` and `goal` [K,3,S,S] uint8, `goal_pose` [K,4], `overlap` [K]."""
 
     def draw_groups(self, count: int, robots: int) -> dict[str, np.ndarray]:
-        """`image` [V,3,S,S] uint8 and pairs of them: `first`, `second` [K], and the same labels."""
+        """`image` [V,3,S,S] uint8, pairs of them `first`, `second` [K], and the same labels."""
 
 
 @dataclasses.dataclass(frozen=True)

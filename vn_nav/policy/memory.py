@@ -14,9 +14,9 @@ from vn_nav.policy.encoders import apply, uniform_by_fan_in
 class RecurrentState(NamedTuple):
     """Memory between calls: hidden and cell of the LSTM, [B,H] each.
 
-    A policy that tracks the goal (`GoalTracker`) keeps its estimate in further columns of `hidden`.
-    A policy on stacked frames keeps its last pictures in `hidden` ([B,K-1,3,S,S] uint8) instead,
-    or their frozen features ([B,K-1,F] float32), and nothing in `cell` ([B,0]).
+    A policy that tracks the goal (`GoalTracker`) keeps its estimate in further columns of
+    `hidden`. A policy on stacked frames keeps its last pictures in `hidden` ([B,K-1,3,S,S] uint8)
+    instead, or their frozen features ([B,K-1,F] float32), and nothing in `cell` ([B,0]).
     """
 
     hidden: Tensor
