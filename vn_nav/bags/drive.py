@@ -1,0 +1,431 @@
+"""Drives out of messages: frames with their poses, and where the robot's actions begin and end.
+
+Any bag will do: pictures raw or compressed, odometry or only the velocity that was commanded, at
+any rate, driven by a policy or by hand. Two stages, both streaming:
+
+`synchronise` gives every camera picture the pose, depth and labels that belong to it, by header
+stamps, and tells episodes apart. `Cutter` finds, along the poses, the pictures between which the
+robot did just one of its discrete actions; what fits no action is kept, and counted.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
+from vn_nav.errors import UserError
+from vn_nav.robot import RobotSpec
+
+WINDOW = 0.05  # s between the stamps of a picture and of what belongs to it
+WAIT = 1.0  # s of recording time that a picture waits for what belongs to it
+GAP = 1.0  # s without a picture end an episode
+COMMAND_LASTS = 0.5  # s that a velocity is believed without a new one, as bases do
+JUMP_SPEED = 5.0  # m/s: faster, somebody has put the robot (or its odometry) elsewhere
+JUMP = 0.3  # m that odometry may be corrected by between two pictures
+MISFIT = -1  # in place of an action
+MIXED = 0.5  # share of an action that a motion may do along another axis beside it
+COARSE = 0.35  # share of an action that may be missing or too much at its end
+
+
+@dataclasses.dataclass(frozen=True)
+class Topics:
+    """Names in the bag, with or without the leading slash; a small YAML file can give others."""
+
+    image: str = 'image_raw'
+    odometry: str = 'odom'
+    command: str = 'cmd_vel'  # stands in where odometry is not recorded
+    goal: str = 'goal_image'
+    depth: str = 'depth/image_raw'
+    labels: str = 'labels/image_raw'
+    episode_end: str = 'episode_end'
+    camera_info: str = 'camera_info'
+
+    def within(self, recorded: Iterable[str]) -> Topics:
+        """The same with the names as they are in a bag: slashes as there, pictures compressed.
+
+        Raises:
+            UserError: no camera picture, or neither odometry nor command.
+        """
+        there = {name.strip('/'): name for name in recorded}
+        found = {}
+        for role, name in dataclasses.asdict(self).items():
+            name = name.strip('/')
+            if role in ('image', 'goal') and name not in there:
+                name = f'{name}/compressed'
+            found[role] = there.get(name, '')
+        if not found['image'] or not (found['odometry'] or found['command']):
+            role = 'image' if not found['image'] else 'odometry or command'
+            wanted = getattr(self, role.split()[0])
+            raise UserError(f'a bag to learn from holds the topic {wanted} ({role})',
+                            sorted(there), 'name the topic of the bag in a YAML file '
+                            f'({role.split()[0]}: /its/name) and give it with --topics')
+        return Topics(**found)
+
+
+def load_topics(path: str | Path) -> Topics:
+    """Read a mapping from the roles of `Topics` to names in the bag.
+
+    Raises:
+        UserError: no such file, no such role, or a name that is none.
+    """
+    try:
+        data = yaml.safe_load(Path(path).read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise UserError('the topics of a bag are in a YAML file', f'{path}: {error}',
+                        'write lines such as image: /camera/color/image_raw') from error
+    known = [field.name for field in dataclasses.fields(Topics)]
+    if not isinstance(data, dict) or not set(data) <= set(known) or not all(
+            isinstance(name, str) and name.strip('/') for name in data.values()):
+        raise UserError(f'a topics file maps some of {", ".join(known)} to names', data,
+                        f'correct {path}')
+    return Topics(**data)
+
+
+class Heard(NamedTuple):
+    """A message of a bag, in the order of recording."""
+
+    topic: str
+    message: Any
+    time: float  # of recording [s]
+
+
+@dataclasses.dataclass
+class Frame:
+    """A camera picture and what belongs to it; pictures are still messages."""
+
+    image: Any
+    stamp: float  # s, of its header; of recording where the header has none
+    time: float  # s, of recording
+    pose: np.ndarray  # [3] x, y [m], yaw [rad] in the frame of the odometry
+    episode: int
+    announced: int  # number of the episode by its announcements alone
+    goal: Any = None
+    depth: Any = None
+    labels: Any = None
+
+
+@dataclasses.dataclass
+class Report:
+    """What a bag held and what of it did not fit."""
+
+    pictures: int = 0
+    without_pose: int = 0  # no odometry within `WINDOW`
+    unordered: int = 0  # stamps that went back
+    bad: int = 0  # velocities and poses that are none
+    jumps: int = 0  # of the pose: a new episode begins
+    episodes: int = 0
+    actions: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    misfits: int = 0  # motions that fit no action
+
+    @property
+    def misfit_share(self) -> float:
+        """Of all motions, those that fit no action."""
+        return self.misfits / max(self.misfits + sum(self.actions.values()), 1)
+
+
+def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> Iterator[Frame]:
+    """Camera pictures with their poses, in order, one episode after the other.
+
+    Poses are interpolated between the odometry before and after a picture, if the nearer of the
+    two lies within `WINDOW`; without odometry, commanded velocities are integrated. An episode
+    ends with a message on `episode_end`, with a new goal, with `GAP` seconds without a picture and
+    where the pose jumps. What is held at a time is bounded by `WAIT` seconds of recording.
+
+    Args:
+        messages: in the order of recording.
+        topics: as `Topics.within` returns them.
+        report: is filled.
+    """
+    track = _Odometry() if topics.odometry else _DeadReckoning()
+    beside = {name: collections.deque() for name in (topics.depth, topics.labels) if name}
+    waiting: collections.deque[tuple[float, float, Any, int, Any]] = collections.deque()
+    episode, goal, goal_stamp = 0, None, None
+    last: Frame | None = None
+    for topic, message, time in messages:
+        if topic == topics.image:
+            report.pictures += 1
+            waiting.append((_stamp(message, time), time, message, episode, goal))
+        elif topic in (topics.odometry, topics.command):
+            if topic == (topics.odometry or topics.command):
+                try:
+                    track.hear(message, time)
+                except MotionError:
+                    report.bad += 1
+        elif topic in beside:
+            beside[topic].append((_stamp(message, time), time, message))
+        elif topic == topics.episode_end:
+            episode += 1
+        elif topic == topics.goal:
+            stamp = _stamp(message, time)
+            if goal_stamp not in (None, stamp):
+                episode += 1
+            goal, goal_stamp = message, stamp
+        while waiting and (track.knows(waiting[0], topics) and _arrived(beside, waiting[0][0])
+                           or waiting[0][1] < time - WAIT):
+            last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
+    while waiting:
+        last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
+
+
+def _settle(picture, track, beside, topics: Topics, last: Frame | None, report: Report):
+    """Yield a picture's frame, if it has one; the last frame that there was."""
+    stamp, time, message, episode, goal = picture
+    pose = track.pose(stamp if topics.odometry else time)
+    if pose is None:
+        report.without_pose += 1
+        return last
+    if last is not None and stamp <= last.stamp and episode == last.episode:
+        report.unordered += 1
+        return last
+    own = {role: _nearest(beside[name], stamp) for role, name in (
+        ('depth', topics.depth), ('labels', topics.labels)) if name}
+    number = 0
+    if last is not None:
+        # Episodes are numbered anew, because gaps and jumps begin some that nobody announced.
+        announced = episode != last.announced
+        gap = stamp - last.stamp > GAP or time - last.time > GAP
+        moved = math.hypot(*(pose[:2] - last.pose[:2]))
+        jumped = moved > JUMP + JUMP_SPEED * max(stamp - last.stamp, 0.0)
+        report.jumps += jumped and not announced
+        number = last.episode + (announced or gap or jumped)
+    report.episodes = number + 1
+    frame = Frame(message, stamp, time, pose, number, episode, goal, **own)
+    yield frame
+    return frame
+
+
+class _Odometry:
+    """Poses by header stamps."""
+
+    def __init__(self):
+        self._stamps: collections.deque[float] = collections.deque()
+        self._poses: collections.deque[np.ndarray] = collections.deque()
+
+    def hear(self, message: Any, time: float) -> None:
+        values = odometry_to_array(message)
+        stamp = values[6] or time
+        if self._stamps and stamp <= self._stamps[-1]:
+            if self._stamps[-1] - stamp < WAIT:
+                return  # late or repeated
+            self._stamps.clear()  # a clock that was set back
+            self._poses.clear()
+        self._stamps.append(stamp)
+        self._poses.append(values[:3])
+        while self._stamps[-1] - self._stamps[0] > 2 * WAIT:
+            self._stamps.popleft()
+            self._poses.popleft()
+
+    def knows(self, picture: tuple, topics: Topics) -> bool:
+        return bool(self._stamps) and self._stamps[-1] >= picture[0]
+
+    def pose(self, stamp: float) -> np.ndarray | None:
+        stamps = np.array(self._stamps)
+        if not len(stamps):
+            return None
+        after = int(np.searchsorted(stamps, stamp))
+        before = max(after - 1, 0)
+        after = min(after, len(stamps) - 1)
+        if min(abs(stamps[before] - stamp), abs(stamps[after] - stamp)) > WINDOW:
+            return None
+        one, other = self._poses[before], self._poses[after]
+        span = stamps[after] - stamps[before]
+        share = np.clip((stamp - stamps[before]) / span, 0, 1) if span > 0 else 0.0
+        pose = one + share * (other - one)
+        pose[2] = one[2] + share * _wrapped(other[2] - one[2])
+        return pose
+
+
+class _DeadReckoning:
+    """Poses from commanded velocities, which carry no stamp of their own: by recording time."""
+
+    def __init__(self):
+        self._pose = np.zeros(3)
+        self._velocity = np.zeros(3)
+        self._from = -math.inf  # when the velocity was heard
+        self._at = None  # time of the pose
+        self._past: collections.deque[tuple[float, np.ndarray]] = collections.deque()
+
+    def hear(self, message: Any, time: float) -> None:
+        velocity = twist_to_array(message)[:3]
+        self._advance(time)
+        self._velocity, self._from = velocity, time
+
+    def knows(self, picture: tuple, topics: Topics) -> bool:
+        return True  # messages come in the order of recording
+
+    def pose(self, time: float) -> np.ndarray:
+        self._advance(time)
+        return self._pose.copy()
+
+    def _advance(self, time: float) -> None:
+        if self._at is not None and time > self._at:
+            lasts = min(time, self._from + COMMAND_LASTS) - self._at
+            if lasts > 0:
+                self._pose = integrate(self._pose, self._velocity, lasts)
+        self._at = time if self._at is None else max(self._at, time)
+
+
+def integrate(pose: np.ndarray, velocity: np.ndarray, seconds: float) -> np.ndarray:
+    """A pose [3] after moving with a constant body velocity [3] vx, vy [m/s], wz [rad/s]."""
+    x, y, yaw = pose
+    vx, vy, wz = velocity
+    turn = wz * seconds
+    # Along an arc; sin(t) / t and (1 - cos t) / t by series where t vanishes.
+    s, c = ((math.sin(turn) / turn, (1 - math.cos(turn)) / turn) if abs(turn) > 1e-6
+            else (1.0, turn / 2))
+    ahead, left = (s * vx - c * vy) * seconds, (c * vx + s * vy) * seconds
+    return np.array([x + math.cos(yaw) * ahead - math.sin(yaw) * left,
+                     y + math.sin(yaw) * ahead + math.cos(yaw) * left, yaw + turn])
+
+
+def _arrived(beside: dict, stamp: float) -> bool:
+    """Whether nothing nearer to a stamp can come any more on the topics beside the picture."""
+    return all(rows and rows[-1][0] >= stamp for rows in beside.values())
+
+
+def _nearest(rows: collections.deque, stamp: float) -> Any:
+    """The message nearest to a stamp, within `WINDOW`, or None; older ones are forgotten."""
+    while len(rows) > 1 and rows[1][0] <= stamp:
+        rows.popleft()
+    near = sorted(list(rows)[:2], key=lambda row: abs(row[0] - stamp))
+    return near[0][2] if near and abs(near[0][0] - stamp) <= WINDOW else None
+
+
+def _stamp(message: Any, time: float) -> float:
+    stamp = message.header.stamp
+    return (stamp.sec + stamp.nanosec * 1e-9) or time
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+class Step(NamedTuple):
+    """A frame at which an action begins, and the action; an episode's last frame has none."""
+
+    frame: Frame
+    action: int  # index; `MISFIT`: what followed was none of the robot's actions
+    last: bool  # of its episode: no action follows
+
+
+class Cutter:
+    """Cuts frames into the actions of a robot.
+
+    From a frame on, the robot moves along the axes of its actions. A later frame ends an action
+    if the motion until there is that action to `COARSE`, and less than `MIXED` of one along every
+    other axis; of those that do, the one where it fits best, which shows when the robot has moved
+    on from there. A drive by hand is cut where its curves allow.
+
+    Args:
+        robot: its actions; those that tilt the camera are no part of a drive.
+        report: is filled.
+    """
+
+    MOVED_ON = 0.2  # of an action: the fit is so much worse than it was
+    TOO_FAR = 1.25  # of an action, along any axis: nothing will fit any more
+    STILL = 0.01  # of an action: frames nearer than that to the one before show the same place
+
+    def __init__(self, robot: RobotSpec, report: Report):
+        self._moves = np.array(robot.moves)
+        self._driving = np.abs(self._moves).sum(1) > 0
+        # The largest action of each axis is what motion beside an action is measured by.
+        length = np.abs(self._moves[:, :2]).max() or 0.5
+        turn = np.abs(self._moves[:, 2]).max() or math.radians(30)
+        self._unit = np.array([length, length, turn])
+        self._report = report
+        self._begin: Frame | None = None
+        self._last: Frame | None = None
+        self._best: tuple[float, int, Frame] | None = None  # misfit, action, where it ends
+        self._since: list[Frame] = []  # frames after the best end, one a place
+
+    def cut(self, frames: Iterable[Frame]) -> Iterator[Step]:
+        """The steps of some frames; every frame that no step begins at is left out."""
+        for frame in frames:
+            if self._begin is not None and frame.episode != self._begin.episode:
+                yield from self._end()
+            if self._begin is None:
+                self._begin = self._last = frame
+                continue
+            yield from self._go_on(frame)
+            self._last = frame
+        yield from self._end()
+
+    def _go_on(self, frame: Frame) -> Iterator[Step]:
+        moved = _relative(self._begin.pose, frame.pose)
+        action, misfit = self._fit(moved)
+        if misfit < (math.inf if self._best is None else self._best[0]):
+            self._best = misfit, action, frame
+            self._since.clear()
+        elif self._best is not None:
+            before = (self._since or [self._best[2]])[-1]
+            if (np.abs(_relative(before.pose, frame.pose)) > self.STILL * self._unit).any():
+                self._since.append(frame)
+            # What it does now is measured by the nearest action, whether it fits or not.
+            if self._cost(moved).min() > self._best[0] + self.MOVED_ON:
+                yield from self._finish()
+        elif (np.abs(moved) > self.TOO_FAR * self._unit).any():
+            yield self._step(MISFIT, frame)
+
+    def _finish(self) -> Iterator[Step]:
+        """End the action where it fitted best, and go on from there."""
+        _, action, end = self._best
+        rest, self._since, self._best = self._since, [], None
+        yield self._step(action, end)
+        for frame in rest:
+            yield from self._go_on(frame)
+
+    def _step(self, action: int, end: Frame) -> Step:
+        step = Step(self._begin, action, False)
+        if action == MISFIT:
+            self._report.misfits += 1
+        else:
+            self._report.actions[action] += 1
+        self._begin = end
+        return step
+
+    def _end(self) -> Iterator[Step]:
+        while self._best is not None:
+            yield from self._finish()
+        if self._begin is not None:
+            # What is left over is a motion of its own, unless it is next to none.
+            moved = np.abs(_relative(self._begin.pose, self._last.pose)) / self._unit
+            if moved.max() >= MIXED:
+                yield self._step(MISFIT, self._last)
+            yield Step(self._begin, MISFIT, True)
+        self._begin = self._last = None
+
+    def _fit(self, moved: np.ndarray) -> tuple[int, float]:
+        """The action that a motion [3] is, and by how much it is not; infinity: it is none."""
+        share, beside = self._shares(moved), self._beside(moved)
+        cost = np.where((np.abs(share - 1) <= COARSE) & (beside < MIXED), self._cost(moved),
+                        np.inf)
+        action = int(np.argmin(cost))
+        return action, float(cost[action])
+
+    def _cost(self, moved: np.ndarray) -> np.ndarray:
+        cost = np.abs(self._shares(moved) - 1) + 0.5 * self._beside(moved)
+        return np.where(self._driving, cost, np.inf)
+
+    def _shares(self, moved: np.ndarray) -> np.ndarray:
+        """How much of each action a motion [3] is, [A]."""
+        along = (self._moves * moved).sum(1)
+        return along / np.maximum((self._moves**2).sum(1), 1e-12)
+
+    def _beside(self, moved: np.ndarray) -> np.ndarray:
+        """The largest share of an action that a motion does along other axes than each's, [A]."""
+        return np.where(self._moves == 0, np.abs(moved) / self._unit, 0.0).max(axis=1)
+
+
+def _relative(origin: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """A pose [3] in the frame of another: forward, left [m], turned left [rad]."""
+    c, s = math.cos(origin[2]), math.sin(origin[2])
+    x, y = pose[:2] - origin[:2]
+    return np.array([c * x + s * y, c * y - s * x, _wrapped(pose[2] - origin[2])])
