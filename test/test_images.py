@@ -11,6 +11,7 @@ import pytest
 
 from vn_msgs_py import images
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
+from vn_nav.observation import preprocess
 
 
 def image(**fields):
@@ -135,6 +136,24 @@ def test_compressed_round_trip(picture, kind):
     message = images.fill_compressed(SimpleNamespace(), picture, kind, quality=95)
     decoded = decode_rgb(message)
     assert np.abs(decoded.astype(int) - picture).max() <= (0 if kind == 'png' else 12)
+
+
+def test_a_jpeg_is_decoded_no_larger_than_needed():
+    rng = np.random.default_rng(0)
+    picture = cv2.resize(rng.integers(0, 256, (12, 16, 3), np.uint8), (640, 480),
+                         interpolation=cv2.INTER_CUBIC)
+    message = images.fill_compressed(SimpleNamespace(), picture, 'jpeg', quality=95)
+    whole = decode_rgb(message)
+    for smallest, shape in ((None, (480, 640)), (241, (480, 640)), (240, (240, 320)),
+                            (84, (120, 160)), (60, (60, 80)), (10, (60, 80))):
+        small = decode_rgb(message, smallest)
+        assert small.shape[:2] == shape
+        gap = np.abs(preprocess(small, 60).astype(int) - preprocess(whole, 60))
+        assert gap.mean() < 1 and gap.max() <= 12
+    odd = images.fill_compressed(SimpleNamespace(), picture[:483 - 6, :637], 'jpeg')
+    assert decode_rgb(odd, 100).shape == (120, 160, 3)
+    png = images.fill_compressed(SimpleNamespace(), picture, 'png')
+    assert np.array_equal(decode_rgb(png, 84), picture)
 
 
 def test_truncated_and_foreign_compressed_pictures(picture):

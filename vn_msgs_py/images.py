@@ -54,19 +54,28 @@ ENCODINGS = {
     'bayer_gbrg8': Encoding(np.uint8, 1, cv2.COLOR_BayerGR2RGB),
     'bayer_grbg8': Encoding(np.uint8, 1, cv2.COLOR_BayerGB2RGB),
 }
+# Parts of a JPEG's size that it can be decoded to (libjpeg scales its inverse transform).
+REDUCED = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4,
+           8: cv2.IMREAD_REDUCED_COLOR_8}
 COLOUR = tuple(name for name in ENCODINGS if name not in ('16UC1', '32FC1'))
 DEPTH = ('16UC1', 'mono16', '32FC1')
 LABELS = ('mono8', '8UC1', '16UC1', 'mono16')
 
 
-def decode_rgb(message: Any) -> np.ndarray:
+def decode_rgb(message: Any, smallest: int | None = None) -> np.ndarray:
     """A picture as [H,W,3] uint8 RGB, from an Image or a CompressedImage.
+
+    Args:
+        message: the picture.
+        smallest: pixels that its shorter side must keep. A JPEG is then decoded straight to a
+            half, a quarter or an eighth of its size where that leaves as many, in a fraction of
+            the time. None: whole.
 
     Raises:
         ImageError: anything that is not exactly a picture in a known encoding.
     """
     if hasattr(message, 'format'):
-        return _decompress(message)
+        return _decompress(message, smallest)
     raw = _raw_array(message, COLOUR)
     encoding = ENCODINGS[message.encoding]
     if message.encoding == 'rgb8':
@@ -136,12 +145,13 @@ def _check_size(height: int, width: int) -> None:
                          'lower the resolution of the camera')
 
 
-def _decompress(message: Any) -> np.ndarray:
+def _decompress(message: Any, smallest: int | None) -> np.ndarray:
     data = bytes(message.data)
     kind = str(message.format).lower()
     if 'compresseddepth' in kind:
         raise ImageError('a compressed picture is JPEG or PNG', message.format,
                          'republish depth as raw (image_transport republish)')
+    scale = 1
     if data[:3] == b'\xff\xd8\xff':
         size, complete = _jpeg_size(data), data.rstrip(b'\0')[-2:] == b'\xff\xd9'
     elif data[:8] == b'\x89PNG\r\n\x1a\n':
@@ -154,15 +164,17 @@ def _decompress(message: Any) -> np.ndarray:
         raise ImageError('a compressed picture is complete to its end marker',
                          f'{len(data)} bytes without one', 'the message is truncated: check the '
                          'network and the camera driver')
+    if smallest is not None and data[:3] == b'\xff\xd8\xff':
+        scale = max((k for k in REDUCED if min(size) // k >= smallest), default=1)
     try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), REDUCED.get(scale, cv2.IMREAD_COLOR))
     except cv2.error as error:
         raise ImageError('a compressed picture can be decoded', str(error).splitlines()[0],
                          'check the camera driver') from error
-    if picture is None or picture.shape[:2] != size:
+    if picture is None or picture.shape[:2] != tuple(-(-side // scale) for side in size):
         raise ImageError('a compressed picture can be decoded', f'{len(data)} bytes',
                          'the data is damaged: check the camera driver')
-    return picture
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def _png_size(data: bytes) -> tuple[int, int]:

@@ -61,6 +61,13 @@ def preprocess(image: np.ndarray, size: int, *, fov: float | None = None,
     return np.ascontiguousarray(square.transpose(2, 0, 1))
 
 
+def needed_side(size: int, fov: float | None = None, target_fov: float | None = None) -> int:
+    """Pixels that a picture's shorter side needs so that `preprocess` never enlarges it."""
+    if fov is None or target_fov is None:
+        return size
+    return math.ceil(size / crop_fraction(fov, target_fov))
+
+
 def crop_fraction(fov: float, target_fov: float) -> float:
     """Share of a picture's side that shows `target_fov`, for a pinhole camera with `fov` [rad].
 

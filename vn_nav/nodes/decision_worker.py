@@ -15,7 +15,7 @@ from std_msgs.msg import Bool, Int8, String
 from vn_msgs_py import images
 from vn_nav.errors import UserError
 from vn_nav.nodes.qos import qos
-from vn_nav.observation import crop_fraction, preprocess
+from vn_nav.observation import crop_fraction, needed_side, preprocess
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 
@@ -144,4 +144,5 @@ class DecisionWorker:
     def _prepare(self, message) -> np.ndarray:
         fov = {} if self.camera_fov is None else {
             'fov': self.camera_fov, 'target_fov': self._runtime.camera_fov}
-        return preprocess(images.decode_rgb(message), self._runtime.size, **fov)
+        smallest = needed_side(self._runtime.size, **fov)
+        return preprocess(images.decode_rgb(message, smallest), self._runtime.size, **fov)
