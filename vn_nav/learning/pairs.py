@@ -92,7 +92,7 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
         for group in optimiser.param_groups:
             group['lr'] = config.learning_rate * (1 - 0.95 * share)
         pairs = source.draw_groups(config.groups, config.robots)
-        pose, maps = _look(network, pairs['image'], pairs['first'], pairs['second'])
+        pose, maps = look(network, pairs['image'], pairs['first'], pairs['second'])
         overlap = torch.from_numpy(pairs['overlap'])
         loss = pose_loss(*pose, torch.from_numpy(pairs['goal_pose']), overlap, overlap >= 0)
         for name in drawn:
@@ -131,7 +131,7 @@ def measure(network: Policy, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     for k in range(0, len(pairs['image']), 128):
         views = np.concatenate([pairs['image'][k:k + 128], pairs['goal'][k:k + 128]])
         first = np.arange(len(views) // 2)
-        poses.append(_look(network, views, first, first + len(first))[0])
+        poses.append(look(network, views, first, first + len(first))[0])
     return errors(Pose(*(torch.cat(parts) for parts in zip(*poses, strict=True))), pairs)
 
 
@@ -152,9 +152,17 @@ def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     }
 
 
-def _look(network: Policy, views: np.ndarray, first: np.ndarray, second: np.ndarray
+def look(network: Policy, views: np.ndarray, first: np.ndarray, second: np.ndarray
           ) -> tuple[Pose, Tensor]:
-    """What the network says of pairs of views, and its maps: every view is encoded once."""
+    """What a network says of pairs of views, and its maps; every view is encoded once.
+
+    Args:
+        network: with the head `goal_pose`.
+        views: [V,3,S,S] uint8; first, second: [K] int64, the second is the goal.
+
+    Returns:
+        The poses of K pairs, and maps [K,C,h,w].
+    """
     shown = torch.from_numpy(views)
     goals = network.encode_goals(shown)
     seen = network.encoder.see(shown, network.compute_dtype)
