@@ -15,7 +15,10 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import hashlib
 import os
+import time
+import uuid
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -24,10 +27,46 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from vn_nav.errors import UserError
 from vn_nav.learning import returns
 
 WAIT = 30.0  # min that a process waits for another one
-CONNECT = 1.0  # min that it waits for all of them at the start, see `Processes.join`
+MEET = 5.0  # min that it waits for all of them at the start
+LOOK = 0.05  # s between looks for the others
+
+
+def _meeting_point() -> dict[str, Any]:
+    """Where the processes of this attempt find each other, as arguments of init_process_group.
+
+    From torch 2.4 on torchrun keeps one store for all its attempts: what the processes before a
+    restart wrote there is still in it, and whoever reads the address of a dead one waits for ever.
+    So each process leaves a fresh token and tells whose tokens it sees; when all see the same
+    ones, all are of this attempt, because nothing old can name a fresh token. Under the name of
+    that view the store is empty.
+    """
+    if os.environ.get('TORCHELASTIC_USE_AGENT_STORE') != 'True':
+        return {}  # torchrun has made a new store for this attempt
+    rank, count = int(os.environ['RANK']), int(os.environ['WORLD_SIZE'])
+    store = dist.TCPStore(os.environ['MASTER_ADDR'], int(os.environ['MASTER_PORT']), count,
+                          is_master=False, timeout=datetime.timedelta(minutes=MEET))
+    token = uuid.uuid4().hex
+    store.set(f'vn_nav/token/{rank}', token)
+    until = time.monotonic() + 60 * MEET
+
+    def left(kind: str) -> list[bytes]:
+        names = [f'vn_nav/{kind}/{other}' for other in range(count)]
+        return [store.get(name) if store.check([name]) else b'' for name in names]
+    while True:
+        tokens = left('token')
+        view = hashlib.sha256(b' '.join(tokens)).hexdigest()
+        store.set(f'vn_nav/view/{rank}', view)
+        if all(tokens) and set(left('view')) == {view.encode()}:
+            return {'store': dist.PrefixStore(view, store), 'rank': rank, 'world_size': count}
+        if time.monotonic() > until:
+            raise UserError(f'all {count} processes start within {MEET:g} minutes',
+                            f'{sum(map(bool, tokens))} of them', 'see what torchrun says of the '
+                            'others, on every machine')
+        time.sleep(LOOK)
 
 
 class Objective(nn.Module):
@@ -72,11 +111,9 @@ class Processes:
             gpu = torch.cuda.is_available()
             if gpu:  # the one that `cuda` names from here on
                 torch.cuda.set_device(int(os.environ['LOCAL_RANK']) % torch.cuda.device_count())
-            dist.init_process_group('cpu:gloo,cuda:nccl' if gpu else 'gloo',
-                                    timeout=datetime.timedelta(minutes=CONNECT))
-            # After a restart gloo sometimes waits for ever until all are connected (seen with
-            # torch 2.13): then this attempt fails soon, and torchrun makes the next one.
-            dist.distributed_c10d._set_pg_timeout(datetime.timedelta(minutes=WAIT + patience))
+            dist.init_process_group(
+                'cpu:gloo,cuda:nccl' if gpu else 'gloo', **_meeting_point(),
+                timeout=datetime.timedelta(minutes=WAIT + patience))
         restarts = os.environ['TORCHELASTIC_RESTART_COUNT'] if launched else 0
         processes = cls(dist.get_rank(), dist.get_world_size(), int(restarts) > 0)
         processes.owner = owner
