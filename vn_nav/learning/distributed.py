@@ -38,8 +38,8 @@ LOOK = 0.05  # s between looks for the others
 def _meeting_point() -> dict[str, Any]:
     """Where the processes of this attempt find each other, as arguments of init_process_group.
 
-    From torch 2.4 on torchrun keeps one store for all its attempts: what the processes before a
-    restart wrote there is still in it, and whoever reads the address of a dead one waits for ever.
+    Newer torchruns (2.13 does) keep one store for all their attempts: what the processes before a
+    restart wrote is still in it, and whoever reads the address of a dead one waits for ever.
     So each process leaves a fresh token and tells whose tokens it sees; when all see the same
     ones, all are of this attempt, because nothing old can name a fresh token. Under the name of
     that view the store is empty.
