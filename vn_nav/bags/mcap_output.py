@@ -1,0 +1,257 @@
+"""One MCAP file, written so that whatever ends the writing leaves it whole up to a chunk.
+
+Built on the record types of `mcap`, not on its `Writer`: that ends a chunk only once it has grown
+too large, compresses at zstd's default level (seven times slower than level 1 on a picture with
+sensor noise), and cannot finish a file after a write that failed.
+
+Source: the MCAP specification, https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+CHUNK = 256 * 1024  # bytes of records, or one message if that is larger
+LEVEL = 1  # of zstd
+MAGIC = b'\x89MCAP0\r\n'
+MESSAGE_HEAD = 31  # bytes of a message's record before its data
+
+
+class _Part(NamedTuple):
+    """A stretch of the file that stands: what opens it, or a chunk with its message indexes."""
+
+    end: int = 0  # offset
+    crc: int = 0  # of the file up to there
+    span: tuple[int, int] | None = None  # least and greatest stamp up to there
+    declared: tuple[Schema | Channel, ...] = ()
+    index: bytes = b''  # its record in the summary; bytes, as there may be hundreds of thousands
+    counts: tuple[tuple[int, int], ...] = ()  # channel, messages
+
+
+class McapOutput:
+    """Chunks of messages, unbuffered.
+
+    A method that raises `OSError` has lost the messages of the present chunk alone; `finish` is
+    then the one thing to do.
+
+    Args:
+        path: must not exist.
+
+    Raises:
+        OSError: the file cannot be made.
+    """
+
+    def __init__(self, path: Path):
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        self._parts = [_Part()]
+        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._schemas: dict[str, int] = {}  # id by type
+        self._channels = 0
+        self._begin_chunk()
+        self.counts: collections.Counter[int] = collections.Counter()  # in the file, by channel
+        head = RecordBuilder()
+        head.write(MAGIC)
+        Header('ros2', 'vn_nav').write(head)
+        try:
+            self._append(head.end(), _Part())
+        except OSError:
+            os.close(self._file)
+            os.unlink(path)
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file, without the present chunk."""
+        return self._parts[-1].end
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Least and greatest stamp in the file."""
+        return self._parts[-1].span
+
+    def channel(self, topic: str, kind: str, definition: str, metadata: dict[str, str]) -> int:
+        """Declare a channel, which needs a message in the same chunk; its id.
+
+        Args:
+            topic: name, with the leading slash.
+            kind: package/msg/Type.
+            definition: ros2msg text with all that the type is made of.
+            metadata: of the channel.
+        """
+        if kind not in self._schemas:
+            self._schemas[kind] = len(self._schemas) + 1
+            self._declare(Schema(id=self._schemas[kind], data=definition.encode(),
+                                 encoding='ros2msg', name=kind))
+        self._channels += 1
+        self._declare(Channel(id=self._channels, topic=topic, message_encoding='cdr',
+                              metadata=metadata, schema_id=self._schemas[kind]))
+        return self._channels
+
+    def add(self, channel: int, data: bytes, stamp: int, sequence: int = 0) -> None:
+        """Append a message; a chunk that is full, or would be overfull, is written.
+
+        Args:
+            channel: its id.
+            data: CDR.
+            stamp: ns since 1970.
+            sequence: number that its publisher gave it.
+        """
+        if self._index and self._chunk.count + MESSAGE_HEAD + len(data) > CHUNK:
+            self.flush()
+        index = self._index.setdefault(channel, MessageIndex(channel_id=channel, records=[]))
+        index.records.append((stamp, self._chunk.count))
+        Message(channel_id=channel, log_time=stamp, data=data, publish_time=stamp,
+                sequence=sequence & 0xFFFFFFFF).write(self._chunk)
+        if self._chunk.count >= CHUNK:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the present chunk, if there is a message in it."""
+        if not self._index:
+            return
+        records, indexes, declared = self._chunk.end(), self._index, self._declared
+        self._begin_chunk()
+        stamps = [stamp for index in indexes.values() for stamp, _ in index.records]
+        chunk = Chunk(compression='zstd', data=self._compressor.compress(records),
+                      message_start_time=min(stamps), message_end_time=max(stamps),
+                      uncompressed_crc=zlib.crc32(records), uncompressed_size=len(records))
+        last, builder = self._parts[-1], RecordBuilder()
+        chunk.write(builder)
+        length, offsets = builder.count, {}
+        for channel, index in indexes.items():
+            offsets[channel] = last.end + builder.count
+            index.write(builder)
+        written = builder.end()
+        ChunkIndex(chunk_start_offset=last.end, chunk_length=length,
+                   message_index_offsets=offsets, message_index_length=len(written) - length,
+                   message_start_time=chunk.message_start_time,
+                   message_end_time=chunk.message_end_time, compression='zstd',
+                   compressed_size=len(chunk.data), uncompressed_size=len(records)).write(builder)
+        stamps += last.span or ()
+        counts = tuple((channel, len(index.records)) for channel, index in indexes.items())
+        self._append(written, _Part(span=(min(stamps), max(stamps)), declared=tuple(declared),
+                                    index=builder.end(), counts=counts))
+        self.counts.update(dict(counts))
+
+    def sync(self) -> None:
+        """Have the disk hold what was written, whatever happens to the power."""
+        os.fdatasync(self._file)
+
+    def finish(self, spare: int = 0) -> None:
+        """Write summary and footer, and close; messages since the last `flush` are left out.
+
+        Where the disk is full, chunks are given up from the end until the summary fits.
+
+        Args:
+            spare: bytes that shall be free on the disk afterwards.
+
+        Raises:
+            OSError: not even a file without a message can be finished.
+        """
+        try:
+            while True:
+                summary = self._summary()
+                try:
+                    self._write(summary + bytes(spare))
+                    break
+                except OSError:
+                    if not self._give_up(len(summary) + spare):
+                        raise
+            os.truncate(self._file, self._parts[-1].end + len(summary))
+            os.fsync(self._file)
+        finally:
+            os.close(self._file)
+
+    def _begin_chunk(self) -> None:
+        self._chunk = RecordBuilder()
+        self._index: dict[int, MessageIndex] = {}
+        self._declared: list[Schema | Channel] = []
+
+    def _declare(self, record: Schema | Channel) -> None:
+        record.write(self._chunk)
+        self._declared.append(record)
+
+    def _append(self, data: bytes, part: _Part) -> None:
+        """Write a part whose end and checksum are yet to be filled in."""
+        self._write(data)
+        last = self._parts[-1]
+        self._parts.append(part._replace(end=last.end + len(data),
+                                         crc=zlib.crc32(data, last.crc)))
+
+    def _write(self, data: bytes) -> None:
+        """Write behind the last part; if that fails, the file ends there."""
+        rest, offset = memoryview(data), self._parts[-1].end
+        try:
+            while rest:
+                count = os.pwrite(self._file, rest, offset)
+                rest, offset = rest[count:], offset + count
+        except OSError:
+            os.truncate(self._file, self._parts[-1].end)
+            raise
+
+    def _give_up(self, size: int) -> bool:
+        """Drop chunks from the end that take so many bytes; whether there was one."""
+        end, dropped = self._parts[-1].end, False
+        while self._parts[-1].index and end - self._parts[-1].end < size:
+            self.counts.subtract(dict(self._parts.pop().counts))
+            dropped = True
+        os.truncate(self._file, self._parts[-1].end)
+        return dropped
+
+    def _summary(self) -> bytes:
+        """From the end of the data to the end of the file."""
+        last, builder = self._parts[-1], RecordBuilder()
+        declared = [record for part in self._parts for record in part.declared]
+        schemas = [record for record in declared if isinstance(record, Schema)]
+        channels = [record for record in declared if isinstance(record, Channel)]
+        chunks = [part.index for part in self._parts if part.index]
+        counts = {channel: count for channel, count in self.counts.items() if count}
+        first, latest = last.span or (0, 0)
+        statistics = Statistics(
+            message_count=sum(counts.values()), schema_count=len(schemas),
+            channel_count=len(channels), attachment_count=0, metadata_count=0,
+            chunk_count=len(chunks), message_start_time=first, message_end_time=latest,
+            channel_message_counts=counts)
+        DataEnd(last.crc).write(builder)
+        data_end = builder.end()
+        start, offsets = last.end + len(data_end), []
+        for opcode, group in ((Opcode.SCHEMA, schemas), (Opcode.CHANNEL, channels),
+                              (Opcode.STATISTICS, [statistics]), (Opcode.CHUNK_INDEX, chunks)):
+            begin = builder.count
+            for record in group:
+                if isinstance(record, bytes):
+                    builder.write(record)
+                else:
+                    record.write(builder)
+            if group:
+                offsets.append(SummaryOffset(opcode, start + begin, builder.count - begin))
+        offset_start = start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        summary = builder.end()
+        # The checksum of the summary covers the footer up to the checksum's own place.
+        crc = zlib.crc32(summary + struct.pack('<BQQQ', Opcode.FOOTER, 20, start, offset_start))
+        Footer(start, offset_start, crc).write(builder)
+        return data_end + summary + builder.end() + MAGIC
