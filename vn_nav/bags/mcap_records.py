@@ -1,0 +1,273 @@
+"""The records of MCAP files, read without trust: what they declare is checked, then believed.
+
+Source: the MCAP specification, version 0 (https://mcap.dev/spec). The Python package `mcap` reads
+sound files; here every length, size and checksum is checked before memory is taken for it, and
+whatever is wrong is one error.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import lz4.frame
+import zstandard
+
+from vn_nav.errors import UserError
+
+(HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT,
+ ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END) = range(1, 16)
+A_BAG = 'a bag is a folder with metadata.yaml and MCAP files, or one MCAP file'
+PRIVATE = 0x80  # and above: records of applications, which every reader passes over
+# A chunk of rosbag2 has 768 KiB; a picture at the cap of `vn_msgs_py.images` has 192 MB at most
+# (16 million pixels of twelve bytes). What is larger is no recording of a robot's cameras.
+MAX_RECORD = 256 << 20  # bytes of a message, or of a chunk, compressed or not
+MAX_DECLARED = 16 << 20  # bytes of all schemas and channels of a file; a large robot has 1 MB
+MAX_NAME = 1024  # bytes of the name of a topic or type; ROS allows 255
+MAX_TIME = 2**63 - 1  # ns: the year 2262, and what rosbag2's own times can hold
+
+HEAD = struct.Struct('<BQ')  # opcode, length
+_MESSAGE = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
+_CHUNK = struct.Struct('<QQQI')  # start, end, size, CRC
+# Bytes that a byte can stand for at most: a block of 128 KiB in 4 bytes; a match of 255 bytes.
+_MOST = {'zstd': 1 << 15, 'lz4': 255}
+OVERHEAD = 256  # bytes of memory that a channel takes beside its texts
+
+
+class BagError(UserError):
+    """A bag that cannot be read, or not be trusted: names the file, and the byte if known."""
+
+    def __init__(self, path: str | Path, fault: str, offset: int | None = None, *,
+                 rule: str = 'a bag is readable',
+                 remedy: str = 'save what is whole with `vn_nav bag recover`'):
+        self.path, self.fault, self.offset = Path(path), fault, offset
+        where = f'{path}' if offset is None else f'{path}, byte {offset}'
+        super().__init__(rule, f'{where}: {fault}', remedy)
+
+
+class Connection(NamedTuple):
+    """A channel of a file with its schema."""
+
+    path: Path  # of the file
+    topic: str  # as recorded
+    type: str  # such as sensor_msgs/msg/Image; '' where the file names none
+    encoding: str  # of the messages: cdr
+    schema_encoding: str  # of the definition: ros2msg
+    definition: bytes
+    metadata: tuple[tuple[str, str], ...]  # offered_qos_profiles and the like
+
+
+class Message(NamedTuple):
+    """A message as it was recorded."""
+
+    connection: Connection
+    sequence: int
+    log_time: int  # when it was recorded, ns since 1970
+    publish_time: int  # ns since 1970
+    data: bytes
+
+    @property
+    def topic(self) -> str:
+        """The topic as recorded."""
+        return self.connection.topic
+
+    @property
+    def type(self) -> str:
+        """The type, such as sensor_msgs/msg/Image."""
+        return self.connection.type
+
+
+class Damage(Exception):
+    """What is wrong at a place; `whole`: where the record ends can be believed."""
+
+    def __init__(self, fault: str, *, whole: bool = False, cost: int = 0):
+        super().__init__(fault)
+        self.fault, self.whole, self.cost = fault, whole, cost
+
+
+class Fields:
+    """The fields of a record, one after the other; damage where they go beyond its end."""
+
+    def __init__(self, data: bytes, at: int = 0):
+        self._data, self.at = data, at
+
+    @property
+    def left(self) -> int:
+        return len(self._data) - self.at
+
+    def numbers(self, layout: str | struct.Struct) -> tuple[int, ...]:
+        layout = struct.Struct(layout) if isinstance(layout, str) else layout
+        if layout.size > self.left:
+            raise Damage('a record ends within its fields')
+        self.at += layout.size
+        return layout.unpack_from(self._data, self.at - layout.size)
+
+    def data(self) -> bytes:
+        size, = self.numbers('<I')
+        if size > self.left:
+            raise Damage(f'a field declares {size} bytes where {self.left} are left')
+        self.at += size
+        return bytes(self._data[self.at - size:self.at])
+
+    def text(self, *, name: bool = False) -> str:
+        data = self.data()
+        try:
+            text = data.decode()
+        except UnicodeDecodeError as error:
+            raise Damage(f'a text is not UTF-8: {data[:32]!r}') from error
+        if name and (len(data) > MAX_NAME or not text.isprintable()):
+            raise Damage(f'a name is not printable, or longer than {MAX_NAME}: {data[:32]!r}')
+        return text
+
+
+class Declared:
+    """The schemas and channels of a file as they come by.
+
+    Args:
+        path: of the file.
+        wanted: whether the messages of a topic are asked for.
+    """
+
+    def __init__(self, path: Path, wanted: Callable[[str], bool]):
+        self._path, self._wanted, self._size = path, wanted, 0
+        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self.channels: dict[int, Connection] = {}
+        self.chosen: dict[int, Connection | None] = {}  # None: not asked for
+
+    def schema(self, fields: Fields) -> None:
+        number, = fields.numbers('<H')
+        schema = fields.text(name=True), fields.text(name=True), fields.data()
+        if number == 0:
+            raise Damage('a schema has the number 0')
+        if self._schemas.setdefault(number, schema) is schema:
+            self._grow(sum(map(len, schema)))
+        elif self._schemas[number] != schema:
+            raise Damage(f'schema {number} ({schema[0]}) is declared twice, and differently')
+
+    def channel(self, fields: Fields) -> None:
+        number, schema = fields.numbers('<HH')
+        topic, encoding = fields.text(name=True), fields.text(name=True)
+        pairs, metadata = Fields(fields.data()), []
+        while pairs.left:
+            metadata.append((pairs.text(), pairs.text()))
+        if schema and schema not in self._schemas:
+            raise Damage(f'the channel of {topic} has schema {schema}, which nothing declares')
+        name, *definition = self._schemas.get(schema, ('', '', b''))
+        connection = Connection(self._path, topic, name, encoding, *definition,
+                                tuple(sorted(metadata)))
+        if self.channels.setdefault(number, connection) is connection:
+            self._grow(len(topic) + sum(len(a) + len(b) for a, b in metadata) + OVERHEAD)
+            self.chosen[number] = connection if self._wanted(topic) else None
+        elif self.channels[number] != connection:
+            raise Damage(f'channel {number} ({topic}) is declared twice, and differently')
+
+    def again(self, wanted: Callable[[str], bool]) -> Declared:
+        """The same declarations, with other topics asked for."""
+        copy = Declared(self._path, wanted)
+        copy._size, copy._schemas = self._size, dict(self._schemas)
+        copy.channels = dict(self.channels)
+        copy.chosen = {k: c if wanted(c.topic) else None for k, c in self.channels.items()}
+        return copy
+
+    def _grow(self, size: int) -> None:
+        self._size += size
+        if self._size > MAX_DECLARED:
+            raise Damage(f'schemas and channels have more than {MAX_DECLARED} bytes')
+
+
+def words(error: Exception) -> str:
+    """What an error of the system or of a decompressor says."""
+    return 'it takes more memory than there is' if isinstance(error, MemoryError) else str(error)
+
+
+def pairs(fields: Fields) -> bytes:
+    """The bytes of a map of 16-bit to 64-bit numbers."""
+    data = fields.data()
+    if len(data) % 10:
+        raise Damage('a map of the summary has half an entry')
+    return data
+
+
+def chunk_fields(body: bytes, length: int) -> tuple[int, int, int, int, str, int]:
+    """Start, end [ns], size, CRC and compression of a chunk, and where its records begin."""
+    fields = Fields(body)
+    start, end, size, crc = fields.numbers(_CHUNK)
+    compression = fields.text(name=True)
+    stored, = fields.numbers('<Q')
+    if stored != length - fields.at:
+        raise Damage(f'a chunk declares {stored} bytes and has {length - fields.at}')
+    if size > MAX_RECORD:
+        raise Damage(f'a chunk declares {size} bytes, more than {MAX_RECORD}', whole=True)
+    return start, end, size, crc, compression, fields.at
+
+
+def unpacked(body: bytes) -> tuple[bytes, tuple[int, int]]:
+    """The records of a chunk, and the time [ns] of its first and last message."""
+    start, end, size, crc, compression, at = chunk_fields(body, len(body))
+    stored, cost = memoryview(body)[at:], len(body) + size
+    try:
+        data = _inflate(stored, compression, size)
+    except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+        raise Damage(f'a chunk cannot be decompressed ({compression}): {words(error)}',
+                      whole=True, cost=cost) from error
+    if len(data) != size:
+        raise Damage(f'a chunk declares {size} bytes and holds another number', whole=True,
+                      cost=cost)
+    if crc and zlib.crc32(data) != crc:
+        raise Damage('the checksum of a chunk does not match', whole=True, cost=cost)
+    return data, (start, end)
+
+
+def _inflate(stored: memoryview, compression: str, size: int) -> bytes:
+    """The `size` bytes that a chunk declares; never takes memory for more."""
+    if compression == '':
+        return bytes(stored)
+    if size > _MOST.get(compression, size) * len(stored):
+        raise ValueError(f'{len(stored)} bytes cannot stand for {size}')
+    if compression == 'zstd':
+        # The frame's own size, if it has one, goes before max_output_size.
+        declared = zstandard.frame_content_size(stored)
+        if declared not in (-1, size):
+            raise ValueError(f'the frame declares {declared} bytes, the chunk {size}')
+        return zstandard.ZstdDecompressor().decompress(
+            stored, max_output_size=max(size, 1), allow_extra_data=False)
+    if compression == 'lz4':
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = decompressor.decompress(stored, max_length=size + 1)
+        if not decompressor.eof or decompressor.unused_data:
+            raise ValueError('the frame is not complete, or not alone')
+        return data
+    raise ValueError('the compression is zstd, lz4 or none')
+
+
+def records(data: bytes, declared: Declared) -> Iterator[Message]:
+    """The messages that are asked for among records; declarations are noted."""
+    at, end, chosen, size = 0, len(data), declared.chosen, _MESSAGE.size
+    while at < end:
+        if data[at] == MESSAGE and end - at >= size:
+            _, length, channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, at)
+            at += size
+            stop = at + length - (size - HEAD.size)
+            if not at <= stop <= end or log_time > MAX_TIME or publish_time > MAX_TIME:
+                raise Damage(f'a message declares {length} bytes and the times {log_time} and '
+                              f'{publish_time} ns', whole=True)
+            if channel not in chosen:
+                raise Damage(f'a message is of channel {channel}, which nothing declares',
+                              whole=True)
+            connection = chosen[channel]
+            if connection is not None:
+                yield Message(connection, sequence, log_time, publish_time, data[at:stop])
+            at = stop
+            continue
+        fields = Fields(data, at)
+        opcode, length = fields.numbers(HEAD)
+        if length > fields.left or opcode not in (SCHEMA, CHANNEL) and opcode < PRIVATE:
+            raise Damage(f'a chunk holds a record of kind {opcode} with {length} bytes',
+                          whole=True)
+        at = fields.at + length
+        if opcode in (SCHEMA, CHANNEL):
+            fields = Fields(data[fields.at:at])
+            declared.schema(fields) if opcode == SCHEMA else declared.channel(fields)
