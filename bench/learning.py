@@ -100,8 +100,10 @@ def main():
                         env=os.environ | {'OMP_NUM_THREADS': '1'}), folder
         time.sleep(2)
     subprocess.run([sys.executable, '-m', 'vn_nav.cli', 'compare',
-                    *map(str, sorted(CURVES.iterdir())), '--out', str(CURVES / 'table.html'),
-                    '--json', str(CURVES / 'table.json')], check=True, cwd=ROOT)
+                    *(str(folder.relative_to(ROOT)) for folder in sorted(CURVES.iterdir())
+                      if folder.is_dir()),
+                    '--out', str(CURVES / 'table.html'), '--json', str(CURVES / 'table.json')],
+                   check=True, cwd=ROOT)
 
 
 if __name__ == '__main__':
