@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.overlap import relative_pose
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.memory import GoalTracker
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
-from vn_sim_bridge.overlap import relative_pose
 
 ROBOT = RobotSpec().with_actions((*DRIVE_ACTIONS, 'left'))
 STEPS = 30

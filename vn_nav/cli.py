@@ -9,9 +9,11 @@ import os
 import platform
 import shlex
 import sys
+import time
 from pathlib import Path
 
 from vn_nav import __version__
+from vn_nav.bags.command import add_bag_commands
 from vn_nav.errors import UserError
 from vn_nav.evaluation.command import (
     SPLIT_HOUSES,
@@ -22,6 +24,7 @@ from vn_nav.evaluation.command import (
     run_compare,
 )
 from vn_nav.learning.command import add_train_options, train_config, world_options
+from vn_nav.learning.pretrain_command import add_pretrain_options, run_pretrain
 
 BACKENDS = ('house',)
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
@@ -48,6 +51,21 @@ def build_parser() -> argparse.ArgumentParser:
     add_train_options(train)
     train.set_defaults(run=run_train)
 
+    collected = commands.add_parser(
+        'collect', help='record pictures from random poses as a bag, for pre-training')
+    _add_world(collected)
+    collected.add_argument('--houses', type=int, metavar='N', help='the first N training houses')
+    collected.add_argument('--pictures', type=int, default=20_000,
+                           help='in all (thesis, 5.7: 20,000)')
+    collected.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
+    collected.add_argument('--threads', type=int, default=1, help='that draw')
+    collected.add_argument('--out', type=Path, required=True, help='folder of the bag')
+    collected.set_defaults(run=run_collect)
+
+    pretrained = commands.add_parser('pretrain', help='pre-train a policy on recorded bags')
+    add_pretrain_options(pretrained)
+    pretrained.set_defaults(run=run_pretrain)
+
     measured = commands.add_parser('evaluate', help='measure a checkpoint')
     measured.add_argument('checkpoint', type=Path)
     _add_world(measured, defaults=False)
@@ -72,6 +90,8 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument('--onnx', type=Path, required=True, metavar='FOLDER',
                         help='for policy.onnx and goal.onnx')
     export.set_defaults(run=run_export)
+
+    add_bag_commands(commands.add_parser('bag', help='check and repair recorded drives'))
 
     house = commands.add_parser('house', help='look at an embedded house')
     actions = house.add_subparsers(dest='action', required=True, metavar='ACTION')
@@ -142,6 +162,31 @@ def _check_gpu(device: str) -> None:
         raise UserError('the device is a GPU that torch and Warp find', f'{device}; they find '
                         f'{known or "none"}', 'look at nvidia-smi and at torch.version.cuda, or '
                         'use --device cpu')
+
+
+def run_collect(args) -> int:
+    """`vn_nav collect`."""
+    _check_backend(args.backend)
+    from vn_nav.bags.recorder import BagWriter
+    from vn_nav.robot import RobotSpec, load_robot
+    from vn_sim_bridge.collect import collect, house_scenes
+    from vn_sim_bridge.houses.splits import SPLITS
+    from vn_sim_bridge.randomisation import load_randomisation
+    if args.house and args.houses:
+        raise UserError('pictures are of named houses or of the first N', '--house and --houses',
+                        'give one of them')
+    count = 1 if args.houses is None else max(args.houses, 0)
+    houses = args.house or list(SPLITS['train'][:count])
+    robot = load_robot(args.robot) if args.robot else RobotSpec()
+    scenes = house_scenes(houses, args.rooms, args.size, robot,
+                          load_randomisation(args.randomisation), args.seed, args.threads)
+    begun = time.monotonic()
+    done = collect(scenes, len(houses), args.pictures, robot,
+                   lambda topics: BagWriter(args.out, topics))
+    seconds = time.monotonic() - begun
+    print(f'{args.out}: {done.pictures:,} pictures in {done.episodes:,} episodes of {done.scenes} '
+          f'house{"s" * (done.scenes > 1)}, {done.pictures / seconds:,.0f} pictures/s')
+    return 0
 
 
 def run_train(args) -> int:

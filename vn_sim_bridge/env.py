@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from vn_nav.errors import UserError
+from vn_nav.overlap import GRID, lift, overlap, relative_pose
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge import tasks
 from vn_sim_bridge.backends.base import Frames
@@ -21,7 +22,6 @@ from vn_sim_bridge.explorer import Explorer
 from vn_sim_bridge.houses.house import CELL, interpolate
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.overlap import GRID, lift, overlap, relative_pose
 from vn_sim_bridge.randomisation import Randomisation
 from vn_sim_bridge.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.world import motion_noise

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 
 from vn_nav.errors import UserError
+from vn_nav.overlap import lift, overlap, relative_pose
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge import tasks
 from vn_sim_bridge.backends.base import Frames
@@ -16,7 +17,6 @@ from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.counter_random import Stream, key, uniform
 from vn_sim_bridge.houses.house import CELL, DistanceField, FloorMap
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.overlap import lift, overlap, relative_pose
 from vn_sim_bridge.randomisation import Randomisation
 
 # How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.

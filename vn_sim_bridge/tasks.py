@@ -16,12 +16,18 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+# The rule of arrival is part of this module for those who use tasks.
+from vn_nav.arrival import (  # noqa: F401
+    ARRIVAL_HEADING,
+    ARRIVAL_RADIUS,
+    arrived,
+    heading_error,
+    wrap_angle,
+)
 from vn_sim_bridge.counter_random import Stream, uniform
 from vn_sim_bridge.houses.house import DistanceField, Goal, House
 from vn_sim_bridge.houses.labels import LABEL
 
-ARRIVAL_RADIUS = 0.6  # m, geodesic
-ARRIVAL_HEADING = math.radians(30.0)  # rad
 OBJECT_RADIUS = 1.0  # m, geodesic (thesis, 5.6)
 COLLECT_RADIUS = 0.45  # m, straight: the robot's rim touches the fruit
 VISIBLE_SHARE = 0.045  # of the picture that shows the room's objects (House3D)
@@ -39,21 +45,6 @@ ROOM_OBJECTS = {
     'office': ('desk', 'whiteboard', 'bookshelf'),
     'hall': ('coat_rack', 'bench'),
 }
-
-
-def wrap_angle(angle):
-    """To [-pi, pi)."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
-
-
-def heading_error(yaw, goal_yaw):
-    """Unsigned angle between two headings [rad]."""
-    return np.abs(wrap_angle(yaw - goal_yaw))
-
-
-def arrived(distance, error):
-    """At the goal pose: within the arrival radius and heading."""
-    return (distance <= ARRIVAL_RADIUS) & (error <= ARRIVAL_HEADING)
 
 
 def sparse_reward(success):

@@ -14,13 +14,13 @@ import torch
 import warp as wp
 
 from vn_nav.errors import UserError
+from vn_nav.overlap import GRID, SLACK, TOLERANCE, lift
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge import tasks
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.env import EnvConfig
 from vn_sim_bridge.houses.house import CELL
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.overlap import GRID, SLACK, TOLERANCE, lift
 from vn_sim_bridge.randomisation import draw_appearance
 from vn_sim_bridge.render.pack import FACING
 from vn_sim_bridge.render.warp_renderer import WarpRenderer, camera_frame

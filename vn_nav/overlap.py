@@ -1,7 +1,8 @@
 """How two views of a house relate: the pose of one as the other sees it, and what both show.
 
 Pure functions of poses, depth pictures and cameras. They are labels for learning and figures for
-evaluation; no network is ever shown them.
+evaluation; no network is ever shown them. A leaf, because the simulator and learning from bags
+label by it.
 """
 
 from __future__ import annotations
