@@ -15,7 +15,7 @@ from vn_nav.bags.dataset import Wanted, load_drives
 from vn_nav.bags.drive import MISFIT, Topics
 from vn_nav.bags.reader import read_bag
 from vn_nav.errors import UserError
-from vn_nav.observation import preprocess
+from vn_nav.observation import preprocess, preprocess_map
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 BAG = Path(__file__).parent.parent / 'bags' / 'house_drive'
@@ -91,3 +91,14 @@ def test_a_bag_that_cannot_be_learned_from_is_refused(tmp_path):
     with pytest.raises(UserError, match='cache'):
         load_drives(BAG, WANTED, tmp_path / 'file' / 'cache')
     assert not [p for p in tmp_path.rglob('*') if p.name != 'file']  # nothing is left behind
+
+
+def test_labels_are_cropped_as_pictures_are_and_never_mixed():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 60, (12, 16)).astype(np.uint8).repeat(40, 0).repeat(40, 1)
+    lens = {'fov': math.radians(100), 'target_fov': math.radians(90)}
+    small = preprocess_map(labels, 84, **lens)
+    picture = preprocess(np.repeat(labels[..., None], 3, 2), 84, **lens)[0]
+    assert small.shape == (84, 84) and set(np.unique(small)) <= set(np.unique(labels))
+    assert (np.abs(small.astype(int) - picture) <= 1).mean() > 0.55  # but at their edges
+    assert np.array_equal(preprocess_map(small, 84), small)

@@ -142,11 +142,12 @@ def test_trap_10_the_terms_add_up_to_the_reward():
 
 
 RESIZES = ('resize', 'interpolate', 'grid_sample', 'Upsample')
-# Functions that resize pictures: of cameras, of textures, for people, and for frozen features.
+# Functions that resize pictures: of cameras, of textures, for people, for frozen features, and to
+# tell a black or frozen camera.
 MAY_RESIZE = {
     'vn_nav/observation.py', 'vn_sim_bridge/scene.py', 'vn_sim_bridge/houses/textures.py',
     'vn_sim_bridge/houses/contact_sheet.py', 'vn_sim_bridge/houses/walk.py',
-    'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py',
+    'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor.py',
 }
 
 

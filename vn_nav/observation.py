@@ -61,6 +61,21 @@ def preprocess(image: np.ndarray, size: int, *, fov: float | None = None,
     return np.ascontiguousarray(square.transpose(2, 0, 1))
 
 
+def preprocess_map(values: np.ndarray, size: int, *, fov: float | None = None,
+                   target_fov: float | None = None) -> np.ndarray:
+    """The same square of a depth or label picture [H,W], as [size,size] of its type.
+
+    Never averaged: a mean of class ids or across an edge is nothing that is there. The pixel
+    nearest to each centre is taken.
+    """
+    side = min(values.shape)
+    if fov is not None and target_fov is not None:
+        side = round(side * crop_fraction(fov, target_fov))
+    top, left = (values.shape[0] - side) // 2, (values.shape[1] - side) // 2
+    nearest = ((np.arange(size) + 0.5) * side / size).astype(np.int64)
+    return np.ascontiguousarray(values[top + nearest[:, None], left + nearest])
+
+
 def needed_side(size: int, fov: float | None = None, target_fov: float | None = None) -> int:
     """Pixels that a picture's shorter side needs so that `preprocess` never enlarges it."""
     if fov is None or target_fov is None:

@@ -14,14 +14,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_nav.bags.drive import MISFIT, Cutter, Heard, Report, Step, Topics, synchronise
 from vn_nav.bags.stream import messages, summary
 from vn_nav.errors import UserError
-from vn_nav.observation import crop_fraction, needed_side, preprocess
+from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
 from vn_nav.robot import RobotSpec
 
 FORMAT = 1  # of the files; another one is decoded anew
@@ -156,24 +155,14 @@ def _pictures(frame, wanted: Wanted, fov: float | None) -> dict[str, np.ndarray]
         smallest = needed_side(wanted.size, **lens)
         shown = {'image': preprocess(decode_rgb(frame.image, smallest), wanted.size, **lens)}
         if frame.depth is not None:
-            depth = _square(decode_depth(frame.depth), wanted.size, lens)
+            depth = preprocess_map(decode_depth(frame.depth), wanted.size, **lens)
             shown['depth'] = np.where(np.isfinite(depth), np.clip(
                 np.nan_to_num(depth) * (255 / MAX_DEPTH), 1, 255), 0).astype(np.uint8)
         if frame.labels is not None:
-            shown['labels'] = _square(decode_labels(frame.labels), wanted.size, lens)
+            shown['labels'] = preprocess_map(decode_labels(frame.labels), wanted.size, **lens)
     except ImageError:
         return None
     return shown
-
-
-def _square(picture: np.ndarray, size: int, lens: dict) -> np.ndarray:
-    """Depth or labels [H,W], cropped as `preprocess` does; never averaged: nearest pixels."""
-    side = min(picture.shape)
-    if lens:
-        side = round(side * crop_fraction(lens['fov'], lens['target_fov']))
-    top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
-    square = picture[top:top + side, left:left + side]
-    return cv2.resize(square, (size, size), interpolation=cv2.INTER_NEAREST)
 
 
 def _field_of_view(bag: str | Path, topic: str) -> float | None:
