@@ -124,7 +124,7 @@ CASES = {  # topic that is changed, how, and what is found: severity, topic, wor
     'uncalibrated': ('/camera_info', as_type(INFO, camera_info(START, 0.0)), WARNING,
                      '/camera_info', 'focal length of 0', 0.006),
     'pause': ('/image_raw', between(1.0, 3.0), WARNING, '/image_raw', 'pauses for up to 2', 3.0),
-    'slow odometry': ('/odom', slow, ERROR, '/odom', 'comes at 4.0 Hz', None),
+    'slow odometry': ('/odom', slow, ERROR, '/odom', 'comes at 4.0 Hz: ', None),
     'stamps go back': ('/odom', restamped(-300_000_000), WARNING, '/odom', 'go back', 0.5),
     'stamps twice': ('/odom', repeated, WARNING, '/odom', 'same stamp', 0.05),
     'no stamps': ('/image_raw', unstamped, ERROR, '/image_raw', 'stamps of zero', None),

@@ -7,6 +7,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.doctor import diagnose
 from vn_nav.bags.drive import Topics
 from vn_nav.bags.recorder import BagWriter
 from vn_nav.bags.stream import messages, summary
@@ -153,3 +154,7 @@ def test_too_little_to_collect_is_refused_before_anything_is_written(tmp_path):
         collect(house_scenes((3,), 99, 36, ROBOT, Randomisation(), 0, 1), 1, 8, ROBOT,
                 lambda topics: BagWriter(tmp_path / 'bag', topics))
     assert not (tmp_path / 'bag').exists()
+
+
+def test_the_doctor_finds_nothing_wrong_with_it(bag):
+    assert diagnose(bag[0]).findings == []

@@ -22,6 +22,7 @@ from vn_nav.bags.doctor_figures import (
     Finding,
     HeardTopic,
     Motion,
+    Neighbours,
 )
 from vn_nav.bags.drive import GAP, WINDOW, Topics
 from vn_nav.bags.stream import UNLISTED, Bag, BagError, Connection, Message
@@ -36,6 +37,7 @@ MOVES = 0.1  # m or rad that a robot goes while a picture must not stay the same
 JUMP = 1_000_000_000  # ns by which clocks may disagree from one message to the next
 SKEW = 500_000_000  # ns by which two sensors' stamps may lag behind differently
 SIMULATED = 10**17  # ns (three years): stamps so far from the recorder's time are a simulation's
+MOST_ALONE = 0.05  # share of pictures that may be without a pose beside them
 TOLD = 5  # places of damage that are told one by one
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 TYPES = {  # of each role of `Topics`
@@ -67,6 +69,7 @@ class _Doctor:
         self.start: int | None = None
         self.end = 0
         self._odometry, self._command = Motion(), Command()
+        self._poses = Neighbours(1e9 * WINDOW)
         self._info: Any = None
         self._last: Message | None = None
 
@@ -131,6 +134,10 @@ class _Doctor:
         first = topic.stamps.last is None
         topic.lag.add(at - stamp)
         step = topic.stamps.add(stamp, at)
+        if topic.role == 'image':
+            self._poses.picture(stamp)
+        elif topic.role == 'odometry':
+            self._poses.pose(stamp)
         if first or topic.role not in STAMPED:
             return
         if step < 0:
@@ -286,10 +293,12 @@ class _Doctor:
         if topic.role in ('image', 'odometry') and times.worst > GAP * 1e9:
             self.find(WARNING, name, 'gap', f'pauses for up to {times.worst * 1e-9:.1f} s',
                       times.worst_at, 'episodes end there; record with a faster disk or network')
-        if topic.role == 'odometry' and median is not None and median > 2e9 * WINDOW:
-            self.find(ERROR, name, 'rate', f'comes at {1e9 / median:.1f} Hz', None,
-                      f'publish it at {1 / WINDOW:.0f} Hz: a picture needs a pose within '
-                      f'{WINDOW * 1e3:.0f} ms')
+        if (topic.role == 'odometry' and median is not None and median > 2e9 * WINDOW
+                and self._poses.alone > MOST_ALONE * self._poses.pictures):
+            share = self._poses.alone / self._poses.pictures
+            self.find(ERROR, name, 'rate', f'comes at {1e9 / median:.1f} Hz: {share:.0%} of the '
+                      f'pictures have no pose within {WINDOW * 1e3:.0f} ms', None,
+                      f'publish it at {1 / WINDOW:.0f} Hz')
 
     def _clocks(self, roles: dict[str, list[HeardTopic]], simulated: bool) -> None:
         """Stamps against the recorder's clock, and of one sensor against another's."""

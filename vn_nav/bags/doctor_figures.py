@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import collections
 import dataclasses
 import math
 import statistics
@@ -15,6 +16,25 @@ from vn_nav.bags.stream import Connection
 ERROR, WARNING = 'error', 'warning'
 SAMPLE = 4096  # numbers that a median is taken of, at most
 NOISE = 0.0005  # m and rad: smaller steps of a standing robot must not add up
+
+
+class Neighbours:
+    """How many pictures have no pose within a time of their own stamp; stamps in ns."""
+
+    def __init__(self, window: float):
+        self.pictures = self.alone = 0
+        self._window, self._pose = window, -math.inf
+        self._waiting: collections.deque[int] = collections.deque(maxlen=SAMPLE)
+
+    def picture(self, stamp: int) -> None:
+        self._waiting.append(stamp)
+
+    def pose(self, stamp: int) -> None:
+        while self._waiting and self._waiting[0] <= stamp:
+            at = self._waiting.popleft()
+            self.pictures += 1
+            self.alone += min(stamp - at, at - self._pose) > self._window
+        self._pose = stamp
 
 
 @dataclasses.dataclass
