@@ -225,6 +225,7 @@ def test_every_second_what_has_come_is_in_the_file_and_the_folder_is_a_bag(tmp_p
         assert not bag.stopped
 
 
+@pytest.mark.slow  # it waits for the time to pass
 def test_files_are_split_by_time(tmp_path):
     with BagWriter(tmp_path / 'bag', [TEXT], max_seconds=0.2) as bag:
         for number in range(5):

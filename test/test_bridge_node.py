@@ -229,6 +229,7 @@ def test_the_robot_ends_the_episode_when_stops_are_declared(listener, journey, t
         assert bridge.wait(20) == 0
 
 
+@pytest.mark.slow
 def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
     """The parity test: policy_node and bridge over ROS against NavigationEnv, noise off."""
     sequences, length = 50, 8
