@@ -1,17 +1,16 @@
 """Bags that are written here: what is in them, what other readers say, what a full disk leaves."""
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from faults import no_file_beyond
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
@@ -75,17 +74,6 @@ def assert_every_reader_accepts(folder):
                               capture_output=True, text=True, timeout=60)
         assert done.returncode == 0, done.stdout[-2000:]
     assert counted == told['message_count']
-
-
-@contextmanager
-def no_file_beyond(size):
-    """Fail a write as a full disk does, at a chosen byte."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize('name', FIXTURES)

@@ -10,11 +10,11 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
+from faults import no_file_beyond
 from two_bars import TwoBars, collected
 
 from vn_nav.errors import UserError
@@ -217,16 +217,6 @@ def test_a_lost_replay_is_refilled_and_it_is_said(tmp_path, capsys):
 
 
 # Full disks. A limit on the size of files fails a write as a full disk does, at a chosen byte.
-
-
-@contextmanager
-def no_file_beyond(size):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize('failing', ['training_state', 'metrics.csv'])

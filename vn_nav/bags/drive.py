@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
+from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 
@@ -168,7 +169,7 @@ def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> It
             if goal_stamp not in (None, stamp):
                 episode += 1
             goal, goal_stamp = message, stamp
-        while waiting and (track.knows(waiting[0], topics) and _arrived(beside, waiting[0][0])
+        while waiting and (track.knows(waiting[0][0]) and _arrived(beside, waiting[0][0])
                            or waiting[0][1] < time - WAIT):
             last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
     while waiting:
@@ -223,8 +224,8 @@ class _Odometry:
             self._stamps.popleft()
             self._poses.popleft()
 
-    def knows(self, picture: tuple, topics: Topics) -> bool:
-        return bool(self._stamps) and self._stamps[-1] >= picture[0]
+    def knows(self, stamp: float) -> bool:
+        return bool(self._stamps) and self._stamps[-1] >= stamp
 
     def pose(self, stamp: float) -> np.ndarray | None:
         stamps = np.array(self._stamps)
@@ -239,7 +240,7 @@ class _Odometry:
         span = stamps[after] - stamps[before]
         share = np.clip((stamp - stamps[before]) / span, 0, 1) if span > 0 else 0.0
         pose = one + share * (other - one)
-        pose[2] = one[2] + share * _wrapped(other[2] - one[2])
+        pose[2] = one[2] + share * wrap_angle(other[2] - one[2])
         return pose
 
 
@@ -258,7 +259,7 @@ class _DeadReckoning:
         self._advance(time)
         self._velocity, self._from = velocity, time
 
-    def knows(self, picture: tuple, topics: Topics) -> bool:
+    def knows(self, stamp: float) -> bool:
         return True  # messages come in the order of recording
 
     def pose(self, time: float) -> np.ndarray:
@@ -302,10 +303,6 @@ def _nearest(rows: collections.deque, stamp: float) -> Any:
 def _stamp(message: Any, time: float) -> float:
     stamp = message.header.stamp
     return (stamp.sec + stamp.nanosec * 1e-9) or time
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 class Step(NamedTuple):
@@ -428,4 +425,4 @@ def _relative(origin: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """A pose [3] in the frame of another: forward, left [m], turned left [rad]."""
     c, s = math.cos(origin[2]), math.sin(origin[2])
     x, y = pose[:2] - origin[:2]
-    return np.array([c * x + s * y, c * y - s * x, _wrapped(pose[2] - origin[2])])
+    return np.array([c * x + s * y, c * y - s * x, wrap_angle(pose[2] - origin[2])])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from vn_msgs_py.topics import BEST_EFFORT, LATCHED, topic
+from vn_msgs_py.topics import BEST_EFFORT, LATCHED, Topic, topic
 
 
 def qos(name: str, *, depth: int | None = None) -> QoSProfile:
@@ -14,7 +14,11 @@ def qos(name: str, *, depth: int | None = None) -> QoSProfile:
         name: relative name as in the contract.
         depth: another queue length, for a recorder that must not lose pictures.
     """
-    entry = topic(name)
+    return profile(topic(name), depth=depth)
+
+
+def profile(entry: Topic, *, depth: int | None = None) -> QoSProfile:
+    """The profile of any topic; depth: as of `qos`."""
     return QoSProfile(
         depth=depth or entry.depth,
         reliability=(ReliabilityPolicy.BEST_EFFORT if entry.reliability == BEST_EFFORT

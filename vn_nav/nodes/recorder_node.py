@@ -15,7 +15,7 @@ import time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from vn_msgs_py.topics import BEST_EFFORT, LATCHED, TOPICS, VOLATILE, Topic, topic
@@ -24,7 +24,7 @@ from vn_nav.bags.losses import Losses
 from vn_nav.bags.recorder import MIN_FREE, BagWriter, RecordingStopped
 from vn_nav.errors import UserError
 from vn_nav.nodes.process import Ended, run_node
-from vn_nav.nodes.qos import qos
+from vn_nav.nodes.qos import profile, qos
 
 QUEUE = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
 ROUND = 16  # messages of a topic that are taken before its neighbours have their turn
@@ -166,7 +166,8 @@ class RecorderNode(Node):
         self.writer.add(entry)
         message = _message(entry.type)
         subscription = self.create_subscription(
-            message, entry.name, lambda _: None, _profile(entry), raw=True)
+            message, entry.name, lambda _: None,
+            profile(entry, depth=max(QUEUE, entry.depth)), raw=True)
         name = self.resolve_topic_name(entry.name)
         before = self.taps.get(name)
         self.taps[name] = Tap(entry, name, message, subscription)
@@ -284,15 +285,6 @@ def _message(kind: str) -> type:
     except (ImportError, AttributeError) as error:
         raise UserError('a recorded type is of a message package that is installed', kind,
                         'install or source its package, or leave the topic out') from error
-
-
-def _profile(entry: Topic) -> QoSProfile:
-    return QoSProfile(
-        depth=max(QUEUE, entry.depth),
-        reliability=(ReliabilityPolicy.BEST_EFFORT if entry.reliability == BEST_EFFORT
-                     else ReliabilityPolicy.RELIABLE),
-        durability=(DurabilityPolicy.TRANSIENT_LOCAL if entry.durability == LATCHED
-                    else DurabilityPolicy.VOLATILE))
 
 
 def _weakened(entry: Topic, offers: list) -> Topic:
