@@ -4,9 +4,10 @@
     python bench/learning.py --presets fast --seeds 0 # some of them
 
 A house of two rooms (one room is half solved at random), 84 x 84, 300 decisions at most, one
-thread a run. Every run is limited by its wall-clock time, and its schedules end with it. A run
-that was interrupted goes on; one that has ended is not repeated. Curves go to docs/curves/table/,
-thinned; `vn_nav compare` makes the table and the figure from them.
+thread a run. Every run is limited by its wall-clock time, and its schedules end with it; one that
+has held the table's highest success for a tenth of that time has nothing left to show, and ends. A
+run that was interrupted goes on; one that has ended is not repeated. Curves go to
+docs/curves/table/, thinned; `vn_nav compare` makes the table and the figure from them.
 """
 
 from __future__ import annotations
@@ -14,10 +15,14 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+from vn_nav.errors import UserError
+from vn_nav.evaluation.curves import HOLD, THRESHOLDS, reached, read_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 CURVES = ROOT / 'docs' / 'curves' / 'table'
@@ -36,9 +41,14 @@ def command(preset: str, seed: int, folder: Path, minutes: float) -> list[str]:
 
 
 def is_over(folder: Path, minutes: float) -> bool:
-    """Whether a run has used its time."""
-    rows = read(folder)
-    return bool(rows) and float(rows[-1]['minutes']) >= 0.999 * minutes
+    """Whether a run has used its time, or has held the highest success for a tenth of it."""
+    try:
+        run, = read_runs([folder])
+    except UserError:  # it has hardly begun
+        return False
+    now = run.columns['minutes'][-1]
+    there = reached(run, max(THRESHOLDS))
+    return now >= 0.999 * minutes or there is not None and now >= there[1] + HOLD * minutes
 
 
 def read(folder: Path) -> list[dict]:
@@ -73,14 +83,18 @@ def main():
     arguments = parser.parse_args()
     waiting = [(preset, seed) for seed in arguments.seeds for preset in arguments.presets]
     cores = sorted(os.sched_getaffinity(0))[:2]
-    running: dict[int, tuple[subprocess.Popen, Path]] = {}
+    running: dict[int, tuple[subprocess.Popen, Path, float]] = {}
     arguments.runs.mkdir(parents=True, exist_ok=True)
     while waiting or running:
         for core in cores:
             if core in running:
-                process, folder = running[core]
+                process, folder, minutes = running[core]
                 if process.poll() is None:
-                    continue
+                    if is_over(folder, minutes):
+                        process.send_signal(signal.SIGINT)
+                        process.wait()
+                    else:
+                        continue
                 del running[core]
                 if process.returncode:
                     raise SystemExit(f'{folder.name} ended with {process.returncode}: see its log')
@@ -97,8 +111,8 @@ def main():
                     running[core] = subprocess.Popen(
                         ['taskset', '-c', str(core), *command(preset, seed, folder, minutes)],
                         stdout=log, stderr=subprocess.STDOUT, cwd=ROOT,
-                        env=os.environ | {'OMP_NUM_THREADS': '1'}), folder
-        time.sleep(2)
+                        env=os.environ | {'OMP_NUM_THREADS': '1'}), folder, minutes
+        time.sleep(10)
     subprocess.run([sys.executable, '-m', 'vn_nav.cli', 'compare',
                     *(str(folder.relative_to(ROOT)) for folder in sorted(CURVES.iterdir())
                       if folder.is_dir()),

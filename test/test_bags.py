@@ -215,11 +215,17 @@ def test_every_second_what_has_come_is_in_the_file_and_the_folder_is_a_bag(tmp_p
 
 @pytest.mark.slow  # it waits for the time to pass
 def test_files_are_split_by_time(tmp_path):
+    count, end = 0, time.monotonic() + 30
     with BagWriter(tmp_path / 'bag', [TEXT], max_seconds=0.2) as bag:
-        for number in range(5):
-            bag.write('scene', text(10), START + number)
-            time.sleep(0.25)
-    assert len(information(tmp_path / 'bag')['files']) == 5
+        # The clock of a split is the writing thread's, which a busy machine holds up at will.
+        while len(list((tmp_path / 'bag').glob('*.mcap'))) < 4 and time.monotonic() < end:
+            bag.write('scene', text(10), START + count)
+            count += 1
+            time.sleep(0.05)
+    facts = information(tmp_path / 'bag')
+    assert len(facts['files']) >= 4
+    assert facts['message_count'] == count
+    assert all(file['message_count'] for file in facts['files'])
     assert_every_reader_accepts(tmp_path / 'bag')
 
 
