@@ -93,9 +93,13 @@ def test_equal_seeds_give_equal_trainings(tmp_path):
                            for name in ('one', 'two')))
 
 
-def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path):
-    """Bit for bit, on one thread: the schedule's end is the same, only the process is not."""
-    config = dataclasses.replace(QUICK, bf16=False, frames=1500)
+@pytest.mark.parametrize('overlap', [False, True])
+def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path, overlap):
+    """Bit for bit, on one thread: the schedule's end is the same, only the process is not.
+
+    With a second thread that collects ahead as well: what it has collected is saved too.
+    """
+    config = dataclasses.replace(QUICK, bf16=False, frames=1500, overlap=overlap)
     whole = train(make_env(), config, tmp_path / 'whole', info=FACTS)
     updates = []
 
@@ -107,6 +111,33 @@ def test_an_interrupted_training_ends_as_an_uninterrupted_one(tmp_path):
     assert len(updates) == 5 and updates[-1]['frames'] < 1500
     assert_equal_weights(whole, train(make_env(), config, tmp_path / 'parts', info=FACTS,
                                       resume=True))
+
+
+def test_the_rollout_ahead_was_collected_by_the_weights_before(tmp_path):
+    """Off-policy by one step: its ratios differ from 1 from the second update on."""
+    kl = {}
+    for overlap in (False, True):
+        rows = []
+        config = dataclasses.replace(QUICK, bf16=False, overlap=overlap, minibatches=1,
+                                     learning_rate=0.01, final_learning_rate=0.01)
+        train(make_env(), config, tmp_path / str(overlap), info=FACTS, on_update=rows.append)
+        kl[overlap] = [row['kl'] for row in rows]
+    assert max(kl[False]) < 1e-6 < 1e-5 < min(kl[True][1:])
+    assert kl[True][0] < 1e-6
+
+
+def test_a_failure_of_the_actor_ends_the_training(tmp_path):
+    env = make_env()
+    step, calls = env.step, []
+
+    def fails(actions):
+        calls.append(actions)
+        if len(calls) == 40:  # in the third rollout
+            raise RuntimeError('the simulator has gone')
+        return step(actions)
+    env.step = fails
+    with pytest.raises(RuntimeError, match='gone'):
+        train(env, dataclasses.replace(QUICK, overlap=True), tmp_path / 'run', info=FACTS)
 
 
 def test_learning_rate_and_curriculum_follow_the_frames(tmp_path):

@@ -20,6 +20,9 @@ BUDGETS: dict[str, dict] = {
     'icra2017': {'frames': 20_000, 'learning_rate': 1e-2, 'hidden': 128},
     # By reinforcement alone: a teacher would give the answer away.
     'fast': {'frames': 8000, 'imitation': 0.0, 'teacher_share': 0.0, 'pair_minutes': 0.0},
+    # Turns are all that is decided here: there is no way to reckon.
+    'anywhere': {'frames': 16_000, 'imitation': 0.0, 'teacher_share': 0.0, 'pair_minutes': 0.0,
+                 'track_goal': False, 'features': 128, 'hidden': 128, 'rollout_length': 32},
 }
 
 

@@ -66,6 +66,8 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
                         help='what raises the difficulty')
     parser.add_argument('--bf16', action=argparse.BooleanOptionalAction,
                         help='compute in bfloat16, or in float32')
+    parser.add_argument('--overlap', action=argparse.BooleanOptionalAction,
+                        help='collect while learning, on a second core')
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
                         help='any other number of vn_nav.learning.presets.TrainConfig')
     parser.add_argument('--no-tensorboard', action='store_true')
@@ -77,18 +79,20 @@ def train_config(args: argparse.Namespace) -> TrainConfig:
     Raises:
         UserError: an unknown name or a value outside its range.
     """
-    changes = {name: getattr(args, name) for name in (*NUMBERS, 'channels', 'curriculum', 'bf16')
+    changes = {name: getattr(args, name) for name in (*NUMBERS, 'channels', 'curriculum', 'bf16', 'overlap')
                if getattr(args, name) is not None}
-    known = {field.name for field in dataclasses.fields(TrainConfig)}
+    known = {field.name: field.default for field in dataclasses.fields(TrainConfig)}
     for text in args.set:
         name, equals, value = text.partition('=')
         if not equals or name not in known:
             raise UserError('--set takes NAME=VALUE with a number of TrainConfig', text,
                             f'the names are {", ".join(sorted(known))}')
         try:
-            changes[name] = ast.literal_eval(value)
+            changes[name] = ast.literal_eval({'true': 'True', 'false': 'False'}.get(value, value))
         except (ValueError, SyntaxError):
             changes[name] = value
+        if isinstance(known[name], bool) and not isinstance(changes[name], bool):
+            raise UserError(f'{name} is true or false', value, 'write one of the two')
     if 'frames' in changes:
         changes['frames'] = int(changes['frames'])
     if 'channels' in changes:

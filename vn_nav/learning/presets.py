@@ -11,6 +11,7 @@ starts from it; every number can be changed from the command line.
 | `framestack` | `unreal` with the last four pictures and a linear layer instead of the LSTM (thesis, 5.4) |
 | `icra2017` | Zhu et al. 2017: frozen features of four pictures, siamese layers, layers of its own for each scene; 10 at the goal, -0.01 a step (sections IV-B and IV-C) |
 | `fast` | PPO, early fusion, GAE, Adam, success-driven curriculum; goal poses, learned from picture pairs first |
+| `anywhere` | `fast` for houses that no training saw: a correlation volume, the goal tracked, a teacher that explores (docs/results.md) |
 """  # noqa: E501
 
 from __future__ import annotations
@@ -60,6 +61,9 @@ class TrainConfig(LearnerConfig):
     device: str = 'cpu'  # of the network, and of `vn_nav train`'s simulator; or cuda:0
     bf16: bool | None = None  # None: where the processor multiplies bfloat16 in hardware
     threads: int = 1  # of torch
+    # Collect the next rollout, by the weights before the update, while learning from this one: a
+    # second core's work. The ratio of PPO accounts for it, A2C has no such correction.
+    overlap: bool = False
     checkpoint_seconds: float = 60.0
     tensorboard: bool = False
 
@@ -86,6 +90,9 @@ class TrainConfig(LearnerConfig):
             (self.architecture != 'icra2017' or not self.tasks,
              'the architecture icra2017 learns no auxiliary tasks', self.tasks),
             (self.threads >= 1, 'threads is at least 1', self.threads),
+            (not self.overlap or self.device == 'cpu',
+             'overlap gives simulator and learner a core each: on a GPU they share the device',
+             self.device),
             (re.fullmatch(r'cpu|cuda(:\d+)?', self.device),
              'the device is cpu, or a GPU by its number, such as cuda:0', self.device),
         )
@@ -122,6 +129,13 @@ _A2C = {
     'replay_steps': 32_000, 'replay_batch': 16, 'replay_length': 20, 'pixel_control_gamma': 0.9,
 }
 _UNREAL = _A2C | {'value_replay': 1.0, 'pixel_control': 0.05, 'reward_prediction': 1.0}
+_FAST = {
+    'learning_rate': 4e-4, 'final_learning_rate': 4e-5, 'clip': 0.2, 'epochs': 2,
+    'minibatches': 4, 'entropy_coefficient': 0.008, 'final_entropy_coefficient': 0.003,
+    'frames': 1_600_000, 'rollout_length': 32, 'channels': (16, 32, 64), 'features': 256,
+    'hidden': 256, 'goal_pose': 0.5, 'arrival': 0.2, 'distance': 0.1,
+    'pose_to_memory': True, 'pair_minutes': 2.0, 'pair_houses': 32,
+}
 PRESETS: dict[str, dict] = {
     'a2c': _A2C,
     'unreal': _UNREAL,
@@ -133,21 +147,24 @@ PRESETS: dict[str, dict] = {
         'max_gradient_norm': 40.0, 'start_difficulty': 1.0,
     },
     'thesis': _UNREAL | {'depth': 0.1, 'segmentation': 0.1, 'goal_segmentation': 0.1},
-    'fast': {
-        'learning_rate': 4e-4, 'final_learning_rate': 4e-5, 'clip': 0.2, 'epochs': 2,
-        'minibatches': 4, 'entropy_coefficient': 0.008, 'final_entropy_coefficient': 0.003,
-        'frames': 1_600_000, 'rollout_length': 32, 'channels': (16, 32, 64), 'features': 256,
-        'hidden': 256, 'goal_pose': 0.5, 'arrival': 0.2, 'distance': 0.1,
-        'pose_to_memory': True, 'pair_minutes': 2.0, 'pair_houses': 32,
+    'fast': _FAST,
+    'anywhere': _FAST | {
+        'architecture': 'matching', 'track_goal': True, 'channels': (32, 64, 32), 'blocks': 1,
+        'features': 512, 'hidden': 512, 'rollout_length': 64, 'minibatches': 8,
+        'imitation': 1.0, 'imitation_until': 0.75, 'teacher_share': 0.8, 'teacher_until': 0.5,
+        'start_difficulty': 1.0, 'pair_minutes': 16.0, 'pair_houses': 384, 'frames': 4_200_000,
     },
 }
 _THESIS_ENVIRONMENT = {'envs': 16, 'max_decisions': 900, 'progress_reward': 0.0,
                        'collision_reward': 0.0}
+_FAST_ENVIRONMENT = {'envs': 64, 'max_decisions': 300, 'progress_reward': 1.0,
+                     'collision_reward': -0.02}
 # What each preset learns in, as options of `vn_nav train`.
 ENVIRONMENT: dict[str, dict] = {
     **{name: _THESIS_ENVIRONMENT for name in PRESETS},
     'icra2017': _THESIS_ENVIRONMENT | {'goal_bonus': 9.0, 'step_reward': -0.01},
-    'fast': {'envs': 64, 'max_decisions': 300, 'progress_reward': 1.0, 'collision_reward': -0.02},
+    'fast': _FAST_ENVIRONMENT,
+    'anywhere': _FAST_ENVIRONMENT | {'collision_reward': -0.05},
 }
 
 

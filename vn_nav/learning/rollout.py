@@ -47,6 +47,19 @@ class Rollout:
         """Agent decisions in this batch."""
         return int(self.valid.sum())
 
+    def state_dict(self) -> dict:
+        """Everything but the goal pictures, as plain tensors on the host."""
+        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        rows['observation'] = self.observation._replace(goals=None)._asdict()
+        rows['state'] = list(self.state)
+        return _on_host(rows)
+
+    @staticmethod
+    def from_state(state: dict, goals: Tensor) -> Rollout:
+        """The rollout of a `state_dict`; `goals` [G,3,S,S] are its environment's."""
+        return Rollout(**{**state, 'observation': Observation(**state['observation'] | {
+            'goals': goals}), 'state': RecurrentState(*state['state'])})
+
 
 class Episode(NamedTuple):
     """What is kept of a finished episode."""
@@ -270,6 +283,14 @@ class Collector:
         self.state = RecurrentState(*map(self._tensor, state['memory']))
         for total, saved in zip(self._totals, state['totals'], strict=True):
             total.copy_(saved)
+
+
+def _on_host(rows):
+    if isinstance(rows, dict):
+        return {key: _on_host(value) for key, value in rows.items()}
+    if isinstance(rows, list):
+        return [_on_host(value) for value in rows]
+    return rows if rows is None else rows.cpu()
 
 
 def _episodes(ended: Tensor, facts: Tensor) -> list[Episode]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
+import copy
 import dataclasses
 import math
 import signal
@@ -23,7 +25,7 @@ from vn_nav.learning.log import Log
 from vn_nav.learning.pairs import PairConfig, PairSource, pretrain_pairs
 from vn_nav.learning.presets import TrainConfig
 from vn_nav.learning.replay import Replay
-from vn_nav.learning.rollout import Collector, Episode
+from vn_nav.learning.rollout import Collector, Episode, Rollout
 from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
@@ -31,6 +33,7 @@ from vn_nav.policy.resnet import load_frozen_weights
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
+ACTOR = 500_009  # between the seeds of a learner and of its actor
 RANKS_APART, RESUMPTIONS_APART = 10_007, 1_000_003  # between the seeds of processes and lives
 COLUMNS = ('frames', 'minutes', 'fps', 'tau', 'success', 'return', 'length', 'collisions',
            *BASIC_LOSSES, 'collect_seconds', 'update_seconds', *TASKS)
@@ -150,7 +153,13 @@ class _Training:
         # All processes see that a gradient is not finite, whosever batch it came from.
         self.learner.failed_batch = folder / (
             f'{processes.rank}-{FAILED_BATCH}' if processes.count > 1 else FAILED_BATCH)
-        self.collector = Collector(env, self.network, self.generator, config.privileged)
+        # The actor, which collects while the learner learns, has weights and random numbers of its
+        # own: both are as reproducible as one after the other.
+        self.actor, self.drawn = self.network, self.generator
+        if config.overlap:
+            self.actor, self.drawn = copy.deepcopy(self.network), torch.Generator()
+        self.ahead: tuple[Rollout, list[Episode]] | None = None  # collected, not yet learned from
+        self.collector = Collector(env, self.actor, self.drawn, config.privileged)
         if config.curriculum == 'frames':
             self.curriculum = FrameCurriculum(start=config.start_difficulty)
         else:
@@ -231,6 +240,9 @@ class _Training:
         """Start episodes and random numbers that no other process or life has seen."""
         seed = (self.config.seed + RANKS_APART * self.processes.rank + RESUMPTIONS_APART * life)
         self.generator.manual_seed(seed)
+        if self.actor is not self.network:
+            self.drawn.manual_seed(seed + ACTOR)
+            self.actor.load_state_dict(self.network.state_dict())
         self.env.set_difficulty(self.curriculum.tau)
         self.collector.begin(seed)
 
@@ -242,17 +254,35 @@ class _Training:
             share = max(share, self.seconds / 60 / self.config.minutes)
         return share
 
-    def update(self) -> dict:
-        """Collect one rollout, learn from it, and say how it went (the keys of `COLUMNS`)."""
-        start = time.monotonic()
+    def collect(self) -> tuple[Rollout, list[Episode]]:
+        """One rollout of the actor, and the episodes that ended in it."""
         config = self.config
         share = config.teacher_share * max(1 - self.progress / config.teacher_until, 0.0)
-        rollout, episodes = self.collector.collect(
+        return self.collector.collect(
             config.rollout_length, f'{config.teacher}_action' if config.teacher_share else None,
             share)
+
+    def update(self) -> dict:
+        """Collect one rollout, learn from it, and say how it went (the keys of `COLUMNS`).
+
+        With `config.overlap` the next rollout is collected meanwhile, by the weights before this
+        update.
+        """
+        start = time.monotonic()
+        rollout, episodes = self.ahead or self.collect()
+        self.ahead = None
         middle = time.monotonic()
-        with written(self.folder / REPLAY):
-            losses = self.learner.update(rollout, self.progress)
+        with contextlib.ExitStack() as stack:
+            collecting = None
+            if self.config.overlap:
+                pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(1))
+                collecting = pool.submit(self.collect)
+            with written(self.folder / REPLAY):
+                losses = self.learner.update(rollout, self.progress)
+            if collecting is not None:
+                self.ahead = collecting.result()
+        if self.actor is not self.network:
+            self.actor.load_state_dict(self.network.state_dict())
         end = time.monotonic()
         first = self.env.num_envs * self.processes.rank
         everyone = self.processes.gather((
@@ -314,6 +344,12 @@ class _Training:
         words = [f'resumed at {self.frames:,} frames']
         if state['env'] is not None and self.processes.count == 1:
             self.generator.set_state(state['generator'])
+            if self.config.overlap and state.get('ahead'):
+                self.actor.load_state_dict(state['network'])
+                self.drawn.set_state(state['actor_generator'])
+                rollout, episodes = state['ahead']
+                self.ahead = (Rollout.from_state(rollout, self.collector.goals),
+                              [Episode(*episode) for episode in episodes])
             self.env.set_difficulty(self.curriculum.tau)
             self.collector.load_state_dict(state['collector'])
             self.env.set_state({name: rows.numpy() for name, rows in state['env'].items()})
@@ -346,6 +382,10 @@ class _Training:
             'curriculum': self.curriculum.state_dict(),
             'collector': self.collector.state_dict(),
             'generator': self.generator.get_state(),
+            'actor_generator': self.drawn.get_state(),
+            # Of many processes nobody saves what was collected, as nobody saves the environments.
+            'ahead': None if self.ahead is None or self.processes.count > 1 else (
+                self.ahead[0].state_dict(), [tuple(episode) for episode in self.ahead[1]]),
             'recent': [tuple(episode) for episode in self.recent],
             'frames': self.frames, 'updates': self.updates, 'seconds': self.seconds,
             'env': env,
