@@ -3,68 +3,45 @@
     python bench/presets.py --threads 2
 
 House 3 with two rooms, 84 x 84, the preset's own environments, steps and replay; after the replay
-memory has something to draw from. One JSON line a figure, with the share of time that goes into
-collecting. fp32 and bfloat16 take turns.
+memory has something to draw from. In turns: fp32 and bfloat16, each with all threads in every
+operation and, where there are two, with one that collects while the other learns. One JSON line a
+figure, with the share of time that learning waits for collecting.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
 from common import pin, report
 
-from vn_nav.learning.learner import Learner
+from vn_nav.learning.distributed import Processes
 from vn_nav.learning.presets import ENVIRONMENT, preset
-from vn_nav.learning.replay import Replay
-from vn_nav.learning.rollout import Collector
-from vn_nav.policy.network import Policy
+from vn_nav.learning.trainer import Training
 from vn_sim_bridge.env import PRIVILEGED, EnvConfig, NavigationEnv
 
 WARM_UP = 4  # updates
 
 
-class Training:
-    """One preset's loop.
-
-    Args:
-        name: of the preset; dtype: of its matrix products; threads: of renderer and torch.
-    """
-
-    def __init__(self, name: str, dtype: torch.dtype, threads: int):
-        config = preset(name)
-        world = dict(ENVIRONMENT[name])
-        env = NavigationEnv(EnvConfig(
-            houses=(3,), rooms=2, num_envs=world.pop('envs'),
-            privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world),
-            threads=threads)
-        torch.manual_seed(0)
-        self.network = Policy(config.network(tuple(env.action_names), 84))
-        self.network.compute_dtype = dtype
-        generator = torch.Generator().manual_seed(0)
-        replay = None
-        if config.from_replay:
-            replay = Replay(
-                config.replay_steps // env.num_envs, env.num_envs, 84, torch.from_numpy(env.goals),
-                privileged=tuple(key for key in config.privileged
-                                 if key in ('depth', 'segmentation')),
-                goal_segmentation=(torch.from_numpy(env.goal_segmentation)
-                                   if 'goal_segmentation' in config.privileged else None))
-        self.learner = Learner(self.network, config, generator, replay=replay)
-        self.collector = Collector(env, self.network, generator, config.privileged)
-        self.collector.begin(0)
-        self.steps = config.rollout_length
-        self.envs = env.num_envs
-
-    def update(self) -> tuple[int, float, float]:
-        """Frames, seconds of collecting, seconds of learning."""
-        begun = time.perf_counter()
-        rollout, _ = self.collector.collect(self.steps)
-        middle = time.perf_counter()
-        self.learner.update(rollout)
-        return rollout.frames, middle - begun, time.perf_counter() - middle
+def begun(name: str, bf16: bool, overlap: bool, threads: int, folder: Path) -> Training:
+    """A training of a preset, past its warm-up."""
+    config = preset(name, bf16=bf16, overlap=overlap, threads=1 if overlap else threads,
+                    pair_minutes=0.0)
+    world = dict(ENVIRONMENT[name])
+    env = NavigationEnv(EnvConfig(
+        houses=(3,), rooms=2, num_envs=world.pop('envs'),
+        privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world),
+        threads=config.threads)
+    training = Training(env, config, folder, {}, Processes())
+    training.start(resume=False, init=None, pairs=None)
+    for _ in range(WARM_UP):
+        training.update()
+    return training
 
 
 def main():
@@ -76,25 +53,27 @@ def main():
     parser.add_argument('--updates', type=int, default=3, help='a round')
     arguments = parser.parse_args()
     pin(arguments.threads)
-    torch.set_num_threads(arguments.threads)
+    ways = list(itertools.product((False, True), (False, True)[:min(arguments.threads, 2)]))
     for name in arguments.presets:
-        rows = {word: Training(name, dtype, arguments.threads) for word, dtype in
-                (('fp32', torch.float32), ('bf16', torch.bfloat16))}
-        rates = {word: [] for word in rows}
-        shares = {word: [] for word in rows}
-        for training in rows.values():
-            for _ in range(WARM_UP):
-                training.update()
-        for _ in range(arguments.rounds):
-            for word, training in rows.items():
-                done = np.array([training.update() for _ in range(arguments.updates)])
-                frames, collecting, learning = done.sum(0)
-                rates[word].append(frames / (collecting + learning))
-                shares[word].append(collecting / (collecting + learning))
-        for word, training in rows.items():
-            report(f'training, preset {name}, {word}', rates[word],
-                   f'{training.envs} environments x {training.steps} steps, 84 x 84, '
-                   f'{arguments.threads} thread(s), {np.median(shares[word]):.0%} collecting')
+        with tempfile.TemporaryDirectory() as folder:
+            trainings = {way: begun(name, *way, arguments.threads, Path(folder) / str(way))
+                         for way in ways}
+            rows = {way: [] for way in ways}
+            for _ in range(arguments.rounds):
+                for way, training in trainings.items():
+                    torch.set_num_threads(training.config.threads)
+                    frames, start = training.frames, time.perf_counter()
+                    own = [training.update() for _ in range(arguments.updates)]
+                    seconds = time.perf_counter() - start
+                    waited = sum(row['collect_seconds'] for row in own)
+                    rows[way].append(((training.frames - frames) / seconds, waited / seconds))
+        for (bf16, overlap), training in trainings.items():
+            rates, shares = np.transpose(rows[bf16, overlap])
+            report(f'training, preset {name}, {"bf16" if bf16 else "fp32"}'
+                   f'{", overlapped" if overlap else ""}', rates,
+                   f'{training.env.num_envs} environments x {training.config.rollout_length} '
+                   f'steps, 84 x 84, {arguments.threads} thread(s), '
+                   f'{np.median(shares):.0%} collecting')
 
 
 if __name__ == '__main__':
