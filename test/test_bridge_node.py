@@ -25,6 +25,8 @@ from vn_nav.nodes.qos import qos
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.goal_pictures import GoalPicture, save_goal_pictures
+from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.simulated_robot import TERMINATED, TICK, SimulatedRobot
 from vn_sim_bridge.tasks import wrap_angle
 
@@ -136,8 +138,41 @@ def test_reset_takes_the_goal_pose_and_refuses_a_wall(listener, tmp_path):
         assert episode['goal'] == -1 and episode['goal_pose'][:2] == goal[:2]
 
 
+def test_odom_drifts_and_the_truth_does_not(listener, tmp_path):
+    with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7, noise=False,
+               time='lock_step', odometry_drift=30.0):
+        wait_until(lambda: listener.heard['odom'] and listener.heard['ground_truth/odom']
+                   and listener.command.get_subscription_count(), listener.spin)
+        said, true = listener.pose('odom')[:3], listener.pose()[:3]
+        for _ in range(3):
+            listener.drive((0.0, 0.0, 0.4, 0.0))
+        assert wrap_angle(listener.pose()[2] - true[2]) == pytest.approx(1.2, abs=1e-9)
+        off = wrap_angle(listener.pose('odom')[2] - said[2]) - 1.2
+        assert 0.001 < abs(off) < 0.6  # 6 deg are one standard deviation
+
+
+def test_it_shows_the_goal_pictures_of_a_folder(listener, tmp_path):
+    cells = generate_house(7, rooms=5).floor.centres()
+    rng = np.random.default_rng(0)
+    goals = [GoalPicture(rng.integers(0, 256, (30, 40, 3), np.uint8), (*cells[k], 0.25 * k))
+             for k in range(0, 40, 20)]
+    save_goal_pictures(tmp_path / 'goals', goals)
+    with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7, goals=tmp_path / 'goals'):
+        wait_until(lambda: listener.heard['episode'] and listener.heard['goal_image']
+                   and listener.heard['scene'], listener.spin)
+        episode = json.loads(listener.heard['episode'][0].data)
+        goal = goals[episode['goal']]
+        assert episode['goal_pose'][:3] == pytest.approx(goal.pose)
+        assert np.array_equal(decode_rgb(listener.heard['goal_image'][0]), goal.picture)
+        scene = json.loads(listener.heard['scene'][0].data)
+        assert [own['pose'][:3] for own in scene['goals']] == [
+            pytest.approx(goal.pose) for goal in goals]
+
+
 def test_bad_parameters_are_one_line_and_exit_code_2():
     for parameter, word in (('backend:=thor', 'backend'), ('house:=-3', 'seed'),
+                            ('odometry_drift:=-1.0', 'odometry_drift'),
+                            ('goals:=/nowhere', 'goals.json'),
                             ('stop:=never', 'stop'), ('time:=yesterday', 'time'),
                             ('rooms:=40', 'rooms')):
         done = subprocess.run(

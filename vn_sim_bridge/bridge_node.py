@@ -29,6 +29,7 @@ from vn_nav.nodes.qos import qos
 from vn_nav.robot import RobotSpec, load_robot
 from vn_sim_bridge import tasks
 from vn_sim_bridge.env import STOPS
+from vn_sim_bridge.goal_pictures import load_goal_pictures
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.randomisation import load_randomisation
 from vn_sim_bridge.simulated_robot import TICK, TRUNCATED, SimulatedRobot
@@ -46,8 +47,10 @@ PARAMETERS = {
     'rooms': (5, 'number of rooms, 1 to 12'),
     'robot': ('', 'YAML file of the robot; empty: the standard robot'),
     'size': (84, 'side of the square camera picture [pixels]'),
-    'noise': (True, 'Gaussian motion noise'),
+    'noise': (True, 'Gaussian motion noise, which odom does not see'),
+    'odometry_drift': (0.0, 'errors of odom: 0 none, 1 as of a good indoor robot, more: worse'),
     'randomisation': ('none', 'of light, camera and base: none, standard, rough or a YAML file'),
+    'goals': ('', 'folder of goal pictures with their poses (goals.json); empty: the own ones'),
     'seed': (0, 'of starts, goals and noise'),
     'time': ('real_time', 'real_time or lock_step (docs/architecture.md, "Time")'),
     'mode': ('stop_and_go', 'lock_step: stop_and_go shows pictures at rest, continuous always'),
@@ -76,10 +79,13 @@ class SimBridgeNode(Node):
         self.episodes, self.exit_when_done = values['episodes'], values['exit_when_done']
         self.picture_ticks = max(1, round(1 / (values['camera_rate'] * TICK)))
         robot = load_robot(values['robot']) if values['robot'] else RobotSpec()
+        self.goals = load_goal_pictures(values['goals']) if values['goals'] else []
         self.robot = SimulatedRobot(
             values['house'], values['rooms'], robot=robot, size=values['size'],
             noise=values['noise'], seed=values['seed'], max_decisions=values['max_decisions'],
-            stop=values['stop'], randomisation=load_randomisation(values['randomisation']))
+            stop=values['stop'], randomisation=load_randomisation(values['randomisation']),
+            odometry_drift=values['odometry_drift'],
+            goal_poses=[goal.pose for goal in self.goals] or None)
         self.size, self.start_time = values['size'], values['start_time']
         self.command = np.zeros(4)
         self.command_tick = 0  # when the newest command came, in ticks
@@ -101,6 +107,8 @@ class SimBridgeNode(Node):
              'mode is stop_and_go or continuous'),
             ('camera_rate', 1.0 <= values['camera_rate'] <= 1 / TICK,
              f'camera_rate lies between 1 and {1 / TICK:.0f} Hz'),
+            ('odometry_drift', 0 <= values['odometry_drift'] < math.inf,
+             'odometry_drift is 0 (none) or more'),
             ('size', 16 <= values['size'] <= 1024, 'size lies between 16 and 1024 pixels'),
             ('max_decisions', values['max_decisions'] >= 1, 'max_decisions is at least 1'),
             ('stop', values['stop'] in STOPS, f'stop is {" or ".join(STOPS)}'),
@@ -152,6 +160,8 @@ class SimBridgeNode(Node):
             'world_version': WORLD_VERSION,
             'rooms': len(house.rooms),
             **house.floor_plan(),
+            'goals': [{'room': field.goal.room, 'pose': list(field.goal.pose)}
+                      for field in self.robot.fields],
             'arrival': {'radius': tasks.ARRIVAL_RADIUS,
                         'heading_deg': math.degrees(tasks.ARRIVAL_HEADING)},
             'camera_fov_deg': math.degrees(self.robot.robot.camera_fov),
@@ -226,9 +236,7 @@ class SimBridgeNode(Node):
         self.command = np.zeros(4)
         self.says_arrived = self.goal_taken = False
         self.goal_shown = time.monotonic()
-        frames = self.robot.goal_frames()
-        message = images.fill_image(Image(), np.ascontiguousarray(
-            frames.rgb[0].transpose(1, 2, 0)), 'rgb8')
+        message = images.fill_image(Image(), self._goal_picture(), 'rgb8')
         message.header.stamp = self.stamp()
         message.header.frame_id = OPTICAL_FRAME
         self._episode.publish(String(data=json.dumps({
@@ -237,6 +245,13 @@ class SimBridgeNode(Node):
             'start_distance': episode.start_distance, 'stamp': self.start_time + episode.begun_at,
             'max_decisions': self.robot.max_decisions})))
         self._goal_image.publish(message)
+
+    def _goal_picture(self) -> np.ndarray:
+        """The picture [H,W,3] of the episode's goal."""
+        goal = self.robot.episode.goal
+        if self.goals and goal >= 0:
+            return self.goals[goal].picture
+        return np.ascontiguousarray(self.robot.goal_frames().rgb[0].transpose(1, 2, 0))
 
     def tick(self) -> None:
         """Advance by one tick under the command in force, and publish what follows."""

@@ -33,6 +33,7 @@ class Stream(enum.IntEnum):
     PAIR = 16  # poses of two views
     PAIR_APPEARANCE = 17
     PAIR_SENSOR = 18
+    ODOMETRY = 19  # errors of odometry
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.houses.house import Goal
 from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.odometry import advance, drift_errors
 from vn_sim_bridge.randomisation import Randomisation
 from vn_sim_bridge.world import motion_noise, nominal_sizes
 
@@ -64,20 +66,30 @@ class SimulatedRobot:
         max_decisions: limit of an episode.
         stop: 'arrival' ends an episode, or 'declared': only `declare` does, as in `EnvConfig`.
         randomisation: of light, camera and base; default: nothing varies.
+        odometry_drift: errors of odometry (`odometry.drift_errors`) beside motion noise; 0: none.
+        goal_poses: x, y [m], yaw [rad] of the goals to draw from; default: the house's.
+
+    Raises:
+        UserError: a goal where the robot cannot stand.
     """
 
     def __init__(self, house: int, rooms: int, *, robot: RobotSpec, size: int = 84,
                  noise: bool = True, seed: int = 0, max_decisions: int = 300,
-                 stop: str = 'arrival', randomisation: Randomisation | None = None):
+                 stop: str = 'arrival', randomisation: Randomisation | None = None,
+                 odometry_drift: float = 0.0,
+                 goal_poses: Sequence[tuple[float, float, float]] | None = None):
         self.stop_rule = stop
         self.house = generate_house(house, rooms=rooms)
         self.robot, self.noise, self.seed, self.max_decisions = robot, noise, seed, max_decisions
         self.randomisation = randomisation or Randomisation()
         self.backend = HouseBackend([self.house], [0], robot=robot, size=size,
                                     randomisation=self.randomisation)
-        self.fields = [tasks.GoalField(self.house, goal, 1.0) for goal in self.house.goals]
+        self.fields = (
+            [tasks.GoalField(self.house, goal, 1.0) for goal in self.house.goals]
+            if goal_poses is None else [self._field_at(*pose) for pose in goal_poses])
         self._nominal = nominal_sizes(robot)
         self.tick_count = 0
+        self.odometry_drift = odometry_drift
         self.odometry = np.zeros(3)  # x, y, yaw in the odom frame
         self.velocity = np.zeros(4)  # of the last tick: vx, vy, wz, tilt rate
         self.episode: Episode | None = None
@@ -195,11 +207,8 @@ class SimulatedRobot:
             self.episode.path_length += travelled
         # Odometry counts wheel turns: what was wanted, as far as nothing stood in the way.
         share = travelled / length if length > 0 else 1.0
-        heading = self.odometry[2] + wanted[2] / 2
-        cos, sin = math.cos(heading), math.sin(heading)
-        self.odometry += (share * (cos * wanted[0] - sin * wanted[1]),
-                          share * (sin * wanted[0] + cos * wanted[1]), wanted[2])
-        self.odometry[2] = tasks.wrap_angle(self.odometry[2])
+        turned = share * wanted[0], share * wanted[1], wanted[2]
+        self.odometry = advance(self.odometry, turned, self._odometry_errors(turned))
         self.velocity[:2] *= share
         return None
 
@@ -220,6 +229,12 @@ class SimulatedRobot:
         number = normal(self.seed, Stream.MOTION_NOISE, 0, self.episode.index if self.episode
                         else 0, self.tick_count)
         return motion_noise(wanted[None], np.array([nominal]), np.atleast_1d(number))[0]
+
+    def _odometry_errors(self, turned: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not self.odometry_drift:
+            return 0.0, 0.0, 0.0
+        numbers = normal(self.seed, Stream.ODOMETRY, np.arange(3), 0, self.tick_count)
+        return drift_errors(turned, self.odometry_drift, numbers)
 
     @property
     def in_decision(self) -> bool:

@@ -13,6 +13,7 @@ from vn_sim_bridge.scene import Scene
 CAMERA_HEIGHT = 1.0  # m, the standard robot
 FIELD_OF_VIEW = math.radians(90)
 CANDIDATES = 24  # views looked at in each room
+VIEW = 32  # pixels a side of what is looked at
 WALL_DISTANCE = 0.45  # m that a goal keeps from the walls of its room
 
 
@@ -20,10 +21,9 @@ def choose_goals(scene: Scene, rooms: list[Room], floor: FloorMap, rng: np.rando
                  per_room: int = 1):
     """The best of some random views in every room, as (pose, room name), `per_room` of each.
 
-    A view is good when it shows many different things at a few metres' distance: nobody
-    photographs a blank wall to say where to go.
+    The best as `interest` says.
     """
-    renderer = Rasterizer([scene], 32)
+    renderer = Rasterizer([scene], VIEW)
     centres = floor.centres()
     goals = []
     for room in (room for room in rooms for _ in range(per_room)):
@@ -40,9 +40,20 @@ def choose_goals(scene: Scene, rooms: list[Room], floor: FloorMap, rng: np.rando
                                    np.zeros(CANDIDATES)])
         _, depth, _, instances = renderer.render(np.zeros(CANDIDATES, np.int64), cameras,
                                                  FIELD_OF_VIEW)
-        variety = np.array([(np.unique(view, return_counts=True)[1] > 10).sum()
-                            for view in instances])
-        middle = np.median(depth.reshape(CANDIDATES, -1), axis=1)
-        best = int(np.argmax(variety + 3.0 * np.minimum(middle, 2.5)))
+        best = int(np.argmax(interest(depth, instances)))
         goals.append(((float(xy[best, 0]), float(xy[best, 1]), float(yaw[best]), 0.0), room.name))
     return goals
+
+
+def interest(depth: np.ndarray, instances: np.ndarray) -> np.ndarray:
+    """How good views [K] of `VIEW` pixels a side are as goal pictures; greater is better.
+
+    A view is good when it shows many different things at a few metres' distance: nobody
+    photographs a blank wall to say where to go.
+
+    Args:
+        depth: [K,H,W] m; instances: [K,H,W].
+    """
+    variety = np.array([(np.unique(view, return_counts=True)[1] > 10).sum()
+                        for view in instances])
+    return variety + 3.0 * np.minimum(np.median(depth.reshape(len(depth), -1), axis=1), 2.5)
