@@ -74,7 +74,8 @@ $(READY): setup.py constraints.txt
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,onnx,test]'
 	@touch $@
 
-# The GPU kernels run in Warp's CPU mode too, but only some tests need its 400 MB.
+# The GPU kernels run in Warp's CPU mode too, but only some tests need its 400 MB; or the 280 MB of
+# a video encoder and Parquet.
 $(READY_ALL): $(READY)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot]'
 	@touch $@

@@ -86,6 +86,7 @@ setup(
         'train': ['tensorboard>=2.16'],
         'mesh': ['trimesh>=4.5', 'pillow>=10'],  # OBJ, GLB and glTF in and out
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
+        'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`
         'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels
         'test': [
             'pytest>=8',

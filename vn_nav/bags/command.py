@@ -35,6 +35,42 @@ def add_bag_commands(parser: argparse.ArgumentParser) -> None:
                          help='exit code 2 if something was lost')
     recover.set_defaults(run=run_recover)
 
+    show = actions.add_parser('show', help='write a page about a recorded drive')
+    _add_drive(show)
+    show.add_argument('--out', type=Path, default=Path('report.html'), metavar='HTML',
+                      help='the page; default: report.html')
+    show.add_argument('--checkpoint', type=Path, metavar='DIR',
+                      help='policy to ask what it would have done')
+    show.set_defaults(run=run_show)
+
+    export = actions.add_parser('export', help='write a recorded drive as another kind of data')
+    _add_drive(export)
+    export.add_argument('--lerobot', type=Path, required=True, metavar='OUT',
+                        help='new folder: a LeRobot dataset, version 3.0')
+    export.add_argument('--fps', type=int, default=10, help='frames a second; default: 10')
+    export.set_defaults(run=run_export)
+
+    drive = actions.add_parser(
+        'drive', help='let a policy see a recorded drive, and record what it would have done')
+    _add_drive(drive)
+    drive.add_argument('--checkpoint', type=Path, required=True, metavar='DIR', help='the policy')
+    drive.add_argument('--compare', type=Path, metavar='DIR', help='another one, to compare with')
+    drive.add_argument('--out', type=Path, metavar='FOLDER', help='new: the second bag; with '
+                       '--compare both, and the comparison; default: BAG_shadow')
+    drive.add_argument('--goal', type=Path, metavar='PICTURE', help='where the bag shows none; '
+                       'default: the last picture of each episode')
+    drive.add_argument('--decoding', choices=('sample', 'greedy'),
+                       help='default: as the checkpoint was measured')
+    drive.set_defaults(run=run_drive)
+
+
+def _add_drive(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bag', type=Path, help='rosbag2 folder or MCAP file')
+    parser.add_argument('--topics', type=Path, metavar='YAML',
+                        help='names in the bag, such as image: /camera/color/image_raw')
+    parser.add_argument('--robot', type=Path, metavar='YAML',
+                        help='that drove; default: the standard robot')
+
 
 def run_doctor(args) -> int:
     """`vn_nav bag doctor`: 0 where the bag can be used, 1 where it cannot."""
@@ -62,6 +98,54 @@ def run_recover(args) -> int:
     recovered = recover(args.bag, args.out)
     print('\n'.join(recovered.lines()))
     return 2 if args.strict and recovered.lost else 0
+
+
+def run_show(args) -> int:
+    """`vn_nav bag show`."""
+    from vn_nav.bags.show import show
+    from vn_nav.bags.show_page import show_page
+    from vn_nav.policy.checkpoint import load_checkpoint, write_file
+    from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
+    if not args.out.absolute().parent.is_dir():
+        raise UserError('a file is written into a folder that exists', str(args.out),
+                        'make the folder, or choose another --out')
+    robot = load_robot(args.robot) if args.robot else RobotSpec()
+    checkpoint = load_checkpoint(args.checkpoint) if args.checkpoint else None
+    if checkpoint is not None:
+        robot = robot.with_actions(checkpoint.config.actions, checkpoint.config.moves)
+    elif args.robot is None:
+        robot = robot.with_actions(DRIVE_ACTIONS)
+    shown = show(args.bag, topics=_topics(args.topics), robot=robot, checkpoint=checkpoint)
+    try:
+        write_file(args.out, show_page(str(args.bag), shown, str(args.checkpoint)).encode())
+    except OSError as error:
+        raise UserError('the page can be written', f'{args.out}: {error.strerror}',
+                        'free some space, or choose another --out') from error
+    print(f'page {args.out}')
+    return 0
+
+
+def run_export(args) -> int:
+    """`vn_nav bag export`."""
+    from vn_nav.bags.lerobot import export
+    from vn_nav.robot import RobotSpec, load_robot
+    robot = load_robot(args.robot) if args.robot else RobotSpec()
+    print(export(args.bag, args.lerobot, topics=_topics(args.topics), robot=robot.name,
+                 fps=args.fps))
+    return 0
+
+
+def run_drive(args) -> int:
+    """`vn_nav bag drive`: 0; 130 after SIGINT or SIGTERM, with what was recorded until then."""
+    from vn_nav.bags.shadow_run import run
+    out = args.out or Path(f'{args.bag.resolve().stem}_shadow')
+    return run(args.bag, args.checkpoint, out, other=args.compare, robot=args.robot,
+               topics=_topics(args.topics), goal=args.goal, decoding=args.decoding)
+
+
+def _topics(path: Path | None):
+    from vn_nav.bags.drive import Topics, load_topics
+    return load_topics(path) if path else Topics()
 
 
 def _field_of_view(checkpoint: Path | None, robot: Path | None) -> float | None:

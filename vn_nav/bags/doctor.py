@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -338,14 +339,15 @@ def _short(words: str) -> str:
     return words[:40] if words.isprintable() else repr(words[:40])
 
 
-def diagnose(path: str | Path, *, topics: Topics | None = None, fov: float | None = None
-             ) -> Diagnosis:
+def diagnose(path: str | Path, *, topics: Topics | None = None, fov: float | None = None,
+             listen: Callable[[Message], None] | None = None) -> Diagnosis:
     """Read a bag once and say what is wrong with it.
 
     Args:
         path: a rosbag2 folder or an MCAP file, damaged or not.
         topics: the names of camera, odometry and so on in the bag.
         fov: field of view that the policy needs [rad]; None: cameras are not compared with it.
+        listen: is called with every message, in the order of the files.
 
     Raises:
         BagError: it is no bag.
@@ -353,6 +355,8 @@ def diagnose(path: str | Path, *, topics: Topics | None = None, fov: float | Non
     bag, doctor = Bag(path, strict=False), _Doctor(topics or Topics(), fov)
     for message in bag.messages():
         doctor.hear(message)
+        if listen is not None:
+            listen(message)
     findings = doctor.conclude(bag)
     seconds = 0.0 if doctor.start is None else (doctor.end - doctor.start) * 1e-9
     figures = sorted((topic.figures() for topic in doctor.topics.values()), key=lambda t: t.topic)
