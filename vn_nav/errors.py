@@ -10,3 +10,10 @@ class UserError(Exception):
     def __init__(self, rule: str, received: object, remedy: str):
         self.rule, self.received, self.remedy = rule, received, remedy
         super().__init__(f'{rule}; received {received!r}; {remedy}')
+
+
+class EnvironmentLost(UserError):
+    """An environment that cannot go on, such as a robot whose camera is gone.
+
+    What was learned until then is whole, and worth keeping.
+    """

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import ast
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 
 from vn_nav.errors import UserError
+from vn_nav.learning.learner import PRIVILEGED
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.robot import DRIVE_ACTIONS
 
@@ -29,9 +31,11 @@ NUMBERS = {
     'scenes': (int, 'of icra2017: houses with layers of their own'),
     'pair_minutes': (float, 'pre-train the encoder on picture pairs for so long first'),
     'pair_houses': (int, 'draw pairs from the first so many training houses'),
+    'bag_share': (float, 'with --bags: steps of drives for each step of a rollout'),
     'threads': (int, 'of torch and of the renderer'),
     'device': (str, 'where network and simulator run: cpu, or a GPU such as cuda:0'),
 }
+CHANGES = (*NUMBERS, 'channels', 'curriculum', 'bf16', 'overlap')
 # Options of the environment, whose defaults are the preset's.
 WORLD = {
     'envs': (int, 'environments'),
@@ -50,6 +54,20 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--resume', action='store_true', help='go on with the run in --out')
     parser.add_argument('--init', type=Path, metavar='CHECKPOINT',
                         help='begin with the weights of a checkpoint')
+    parser.add_argument('--env', choices=('house', 'ros'), default='house',
+                        help='where: embedded houses, or robots behind ROS topics')
+    parser.add_argument('--lock-step', action='store_true',
+                        help='with --env ros: the robot is sim_bridge_node with time:=lock_step')
+    parser.add_argument('--namespaces', nargs='+', metavar='NAME',
+                        help='with --env ros: of the topics of several robots')
+    parser.add_argument('--record', type=Path, metavar='BAG',
+                        help='with --env ros: write what is seen into a new bag')
+    parser.add_argument('--bags', type=Path, nargs='+', metavar='BAG',
+                        help='learn from recorded drives as well, in every step')
+    parser.add_argument('--topics', type=Path, metavar='YAML',
+                        help='with --bags: names of the topics in them')
+    parser.add_argument('--cache', type=Path, metavar='DIR',
+                        help='with --bags: of decoded bags; default: OUT/decoded')
     parser.add_argument('--houses', type=int, metavar='N', help='the first N training houses')
     parser.add_argument('--goals-per-room', type=int, default=1)
     parser.add_argument('--goal-variants', type=int,
@@ -71,6 +89,82 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
                         help='any other number of vn_nav.learning.presets.TrainConfig')
     parser.add_argument('--no-tensorboard', action='store_true')
+    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, metavar='ARGUMENTS',
+                        help='with --env ros, last of all: remappings and parameters, such as '
+                        '-r image_raw:=/camera/image_raw -p patience:=600.0')
+
+
+def check_train_options(args: argparse.Namespace) -> None:
+    """Refuse options that have no meaning together.
+
+    Raises:
+        UserError: naming them.
+    """
+    def refuse(names: tuple[str, ...], rule: str, remedy: str) -> None:
+        given = [f'--{name.replace("_", "-")}' for name in names
+                 if getattr(args, name) not in (None, False)]
+        if given:
+            raise UserError(rule, ' '.join(given), remedy)
+    if args.env == 'ros':
+        refuse(('house', 'houses', 'envs', 'pair_minutes', 'goal_variants'),
+               'where robots drive is not for their trainer to choose',
+               'leave these out with --env ros')
+    else:
+        refuse(('lock_step', 'namespaces', 'record', 'ros_args'),
+               'these are for robots behind topics', 'add --env ros')
+    if not args.bags:
+        refuse(('bag_share', 'topics', 'cache'), 'these are for learning from bags',
+               'add --bags BAG')
+    if args.house and args.houses:
+        raise UserError('a training is in named houses or in the first N', '--house and --houses',
+                        'give one of them')
+
+
+def config_over_ros(config: TrainConfig, world: dict, offers: Collection[str], lock_step: bool
+                    ) -> tuple[TrainConfig, list[str]]:
+    """What of a training can be learned where only topics say what happens.
+
+    Heads whose task is left out stay, so that the checkpoint of a simulator fits and bags can go
+    on teaching them.
+
+    Args:
+        config: as it would be in a simulator.
+        world: options of the environment, of `WORLD`.
+        offers: keys of `info` that the topics can give.
+        lock_step: the robot is simulated and waits.
+
+    Returns:
+        The configuration, and what is left out and why, in words.
+
+    Raises:
+        UserError: a device or architecture for which goals must be known before they are seen;
+            or motion while the learner is busy.
+    """
+    rules = (
+        (config.device == 'cpu', 'goals that come one by one are kept on the CPU',
+         f'--device {config.device}', 'leave --device out'),
+        (config.architecture != 'icra2017', 'goals that come one by one are encoded anew',
+         'the architecture icra2017, which does so once', 'choose another --preset'),
+        (lock_step or not config.overlap, 'a robot stands still while the learner is busy',
+         '--overlap', 'leave it out, or train in --lock-step'),
+    )
+    for kept, rule, received, remedy in rules:
+        if not kept:
+            raise UserError(rule, received, remedy)
+    lost = [name for name in config.tasks if not set(PRIVILEGED.get(name, ())) <= set(offers)
+            or name == 'imitation']
+    words = [f'{name} is left out: no topic says {" or ".join(PRIVILEGED.get(name, ("it",)))}'
+             for name in lost]
+    words += [f'{name} is left out: no topic says it'
+              for name in ('progress_reward', 'exploration_reward') if world.get(name)]
+    if config.start_difficulty < 1:
+        words.append('there is no curriculum: robots start where they are')
+    if config.pair_minutes:
+        words.append("there are no picture pairs: they are the simulator's")
+    return dataclasses.replace(
+        config, **dict.fromkeys(lost, 0.0), teacher_share=0.0, pair_minutes=0.0,
+        start_difficulty=1.0, extra_heads=(*config.extra_heads, *(
+            name for name in lost if name != 'imitation'))), words
 
 
 def train_config(args: argparse.Namespace) -> TrainConfig:
@@ -79,8 +173,7 @@ def train_config(args: argparse.Namespace) -> TrainConfig:
     Raises:
         UserError: an unknown name or a value outside its range.
     """
-    changes = {name: getattr(args, name) for name in (*NUMBERS, 'channels', 'curriculum', 'bf16', 'overlap')
-               if getattr(args, name) is not None}
+    changes = {name: getattr(args, name) for name in CHANGES if getattr(args, name) is not None}
     known = {field.name: field.default for field in dataclasses.fields(TrainConfig)}
     for text in args.set:
         name, equals, value = text.partition('=')

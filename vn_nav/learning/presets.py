@@ -24,6 +24,8 @@ from vn_nav.learning.learner import LearnerConfig
 from vn_nav.policy.encoders import LARGE
 from vn_nav.policy.network import NetworkConfig
 
+BAG_WEIGHTS = ('bag_imitation', 'bag_goal_pose', 'bag_arrival', 'bag_distance', 'bag_image')
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(LearnerConfig):
@@ -52,6 +54,17 @@ class TrainConfig(LearnerConfig):
     # Before the first frame: the encoder learns from picture pairs, see `vn_nav.learning.pairs`.
     pair_minutes: float = 0.0
     pair_houses: int = 256
+    pair_learning_rate: float = 1e-3  # at the start
+    # Bags beside rollouts, see `vn_nav.learning.bag_mix`: steps of drives for each step of a
+    # rollout, and the weights of their losses.
+    bag_share: float = 0.25
+    bag_imitation: float = 0.1  # at the start; falls to 0 at `imitation_until`
+    bag_goal_pose: float = 0.5
+    bag_arrival: float = 0.2
+    bag_distance: float = 0.1
+    bag_image: float = 0.1  # of each image head whose key the bags have
+    # Heads beside those of the tasks: of a checkpoint to begin with, taught by bags or by nobody.
+    extra_heads: tuple[str, ...] = ()
     curriculum: str = 'success'  # or 'frames': what raises the difficulty
     start_difficulty: float = 0.3  # tau of the curriculum; 1 switches it off
     success_to_advance: float = 0.75
@@ -84,6 +97,9 @@ class TrainConfig(LearnerConfig):
              'picture pairs teach the task goal_pose: pair_minutes needs its weight',
              self.pair_minutes),
             (self.pair_houses >= 1, 'pair_houses is positive', self.pair_houses),
+            (0 < self.bag_share <= 4, 'bag_share lies in (0, 4]', self.bag_share),
+            *((getattr(self, name) >= 0, f'the weight {name} is not negative',
+               getattr(self, name)) for name in BAG_WEIGHTS),
             (self.architecture == 'icra2017' or not self.frozen_weights,
              'only the architecture icra2017 has a frozen encoder to give weights to',
              self.frozen_weights),
@@ -109,10 +125,11 @@ class TrainConfig(LearnerConfig):
             moves: what the actions do, see `NetworkConfig.moves`; for `track_goal` alone.
         """
         deconvolutions = self.deconvolutions or (1 if size < LARGE else 2)
+        heads = dict.fromkeys((*self.heads, *self.extra_heads))
         return NetworkConfig(
             actions=actions, size=size, architecture=self.architecture, channels=self.channels,
             blocks=self.blocks, features=self.features, hidden=self.hidden,
-            frames=self.stacked_frames, heads=self.heads, deconvolutions=deconvolutions,
+            frames=self.stacked_frames, heads=tuple(heads), deconvolutions=deconvolutions,
             pose_to_memory=self.pose_to_memory, moves=moves if self.track_goal else (),
             pixel_mean=self.pixel_mean,
             pixel_std=self.pixel_std, frozen='resnet50' if self.frozen_weights else '',

@@ -17,7 +17,7 @@ from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
 from vn_nav.bags.drive import Topics, load_topics
 from vn_nav.bags.stream import messages
 from vn_nav.errors import UserError
-from vn_nav.learning.command import NUMBERS, train_config
+from vn_nav.learning.command import CHANGES, train_config
 from vn_nav.learning.hindsight import Drives, split
 from vn_nav.learning.presets import PRESETS, TrainConfig
 from vn_nav.learning.pretrain import PretrainConfig, choose_parts, pretrain
@@ -82,14 +82,8 @@ def run_pretrain(args: argparse.Namespace) -> int:
     topics = load_topics(args.topics) if args.topics else Topics()
     asked = None if args.heads == 'auto' else tuple(
         name for name in args.heads.split(',') if name != 'none')
-    sets, worlds = [], set()
-    for bag in args.bags:
-        scene = _scene(bag)
-        wanted = Wanted(robot, network.size, topics, every=scene.get('poses') == RANDOM_POSES)
-        sets.append(load_drives(bag, wanted, args.cache or args.out / 'decoded'))
-        worlds.add(str(scene.get('world_version', RECORDED)))
-        print(_describe(bag, sets[-1], wanted), flush=True)
-    drives = Drives(sets, robot)
+    drives, worlds = load_bags(args.bags, robot, network.size, topics,
+                               args.cache or args.out / 'decoded')
     parts, words = choose_parts(drives, asked, network.heads, args.cloning)
     told = split(drives, numbers.validation_share, numbers.seed)
     for line in (*words, told.words, f'learns {", ".join(parts).replace("_", " ")}'):
@@ -103,17 +97,38 @@ def run_pretrain(args: argparse.Namespace) -> int:
         'camera_fov_deg': math.degrees(robot.camera_fov), 'camera_height': robot.camera_height,
         'preset': train.preset,
         'command': 'vn_nav ' + shlex.join(word for word in sys.argv[1:] if word != '--resume'),
-        'notes': f'Pre-trained on {len(drives):,} steps of {len(sets)} bag'
-                 f'{"s" * (len(sets) > 1)}: {", ".join(parts).replace("_", " ")}; {told.words}.'}
+        'notes': f'Pre-trained on {len(drives):,} steps of {len(args.bags)} bag'
+                 f'{"s" * (len(args.bags) > 1)}: {", ".join(parts).replace("_", " ")}; '
+                 f'{told.words}.'}
     print(pretrain(policy, drives, parts, told, args.out, numbers, info=info, resume=args.resume,
                    on_epoch=_print_row))
     return 0
 
 
+def load_bags(bags: Sequence[Path], robot: RobotSpec, size: int, topics: Topics, cache: Path
+              ) -> tuple[Drives, set[str]]:
+    """Decode bags (see `load_drives`), and say what each of them holds.
+
+    Returns:
+        The drives, and the world versions of their pictures.
+
+    Raises:
+        UserError: a bag that cannot be used.
+    """
+    sets, worlds = [], set()
+    for bag in bags:
+        scene = scene_of(bag)
+        wanted = Wanted(robot, size, topics, every=scene.get('poses') == RANDOM_POSES)
+        sets.append(load_drives(bag, wanted, cache))
+        worlds.add(str(scene.get('world_version', RECORDED)))
+        print(_describe(bag, sets[-1], wanted), flush=True)
+    return Drives(sets, robot), worlds
+
+
 def _train_config(args: argparse.Namespace, given: LoadedCheckpoint | None) -> TrainConfig:
     """The numbers of a preset, for its network."""
     preset = args.preset or (given.info['preset'] if given else '') or 'fast'
-    blank = dict.fromkeys((*NUMBERS, 'channels', 'curriculum', 'bf16'))
+    blank = dict.fromkeys(CHANGES)
     train = train_config(argparse.Namespace(**blank | {
         'preset': preset, 'set': args.set, 'seed': args.seed, 'no_tensorboard': True,
         'threads': args.threads, 'device': args.device}))
@@ -158,7 +173,7 @@ def _policy(network: NetworkConfig, parts: Sequence[str], given: LoadedCheckpoin
     return policy
 
 
-def _scene(bag: Path) -> dict:
+def scene_of(bag: Path) -> dict:
     """What a simulator said of the scene of a bag; empty: nobody did."""
     first = next(messages(bag, ('scene',)), None)
     try:

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vn_nav.errors import UserError
+from vn_nav.errors import EnvironmentLost, UserError
+from vn_nav.learning.bag_mix import BagMix
 from vn_nav.learning.curriculum import Curriculum, FrameCurriculum
 from vn_nav.learning.distributed import Processes
 from vn_nav.learning.learner import BASIC_LOSSES, TASKS, Learner
@@ -43,7 +44,7 @@ RECENT = 200  # episodes that the shown success, return, length and collisions a
 def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False, info: dict,
           init: str | Path | None = None,
           pairs: Callable[[], tuple[PairSource, PairSource]] | None = None,
-          on_update: Callable[[dict], None] | None = None) -> Path:
+          bags: BagMix | None = None, on_update: Callable[[dict], None] | None = None) -> Path:
     """Train a policy; SIGINT and SIGTERM save and end it early, cleanly.
 
     The folder gets `checkpoint/`, `training_state`, `metrics.csv` and, if asked for,
@@ -69,6 +70,7 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
             seed and world version are filled in.
         init: a checkpoint to begin with.
         pairs: makes the picture pairs for `config.pair_minutes`, and those to judge by.
+        bags: recorded drives, which every step of the optimiser learns from as well.
         on_update: called with each row of the metrics.
 
     Returns:
@@ -77,19 +79,25 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
     Raises:
         UserError: a folder or resumption that does not fit, a full disk, or a loss that is not
             finite; the last save stays as it is.
+        EnvironmentLost: what was learned until then has been saved.
     """
     folder = Path(folder)
     with Processes.join(config.pair_minutes) as processes:
-        training = _Training(env, config, folder, info, processes)
+        training = Training(env, config, folder, info, processes, bags)
         training.start(resume, init, pairs)
-        with _Signals() as stopped, (Log(folder, config, COLUMNS, training.frames)
+        lost: EnvironmentLost | None = None
+        with _Signals() as stopped, (Log(folder, config, training.columns, training.frames)
                                      if processes.leads else contextlib.nullcontext()) as log:
             if not training.updates:
                 training.save(log)  # from here on there is something to resume
             saved = time.monotonic()
             while not processes.any(stopped.is_set()) and training.progress < 1.0:
                 start = time.monotonic()
-                row = training.update()
+                try:
+                    row = training.update()
+                except EnvironmentLost as error:  # it ends a training as a signal does
+                    lost = error
+                    break
                 if log is not None:
                     log.write(row)
                 if on_update is not None:
@@ -100,6 +108,8 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
                     training.save(log)
                     saved = time.monotonic()
             training.save(log)
+            if lost is not None and not stopped.is_set():
+                raise lost
     return folder / CHECKPOINT
 
 
@@ -128,11 +138,15 @@ def has_fast_bfloat16() -> bool:
     return 'avx512_bf16' in flags or 'amx_bf16' in flags
 
 
-class _Training:
+class Training:
     """Everything that changes while training, and its save file."""
 
-    def __init__(self, env, config: TrainConfig, folder: Path, info: dict, processes: Processes):
+    def __init__(self, env, config: TrainConfig, folder: Path, info: dict, processes: Processes,
+                 bags: BagMix | None = None):
         torch.set_num_threads(config.threads)
+        if bags is not None:
+            config = dataclasses.replace(config, extra_heads=(*config.extra_heads, *bags.heads))
+        self.bags, self.columns = bags, COLUMNS + (() if bags is None else bags.columns)
         self.env, self.config, self.folder, self.processes = env, config, folder, processes
         self.info = {**info, 'seed': config.seed, 'world_version': env.world_version}
         size = env.goals.shape[-1]
@@ -148,8 +162,10 @@ class _Training:
             bf16 = has_fast_bfloat16() or self.network.device.type == 'cuda'
         self.network.compute_dtype = torch.bfloat16 if bf16 else torch.float32
         self.generator = torch.Generator(self.network.device)
+        if bags is not None:
+            bags.attach(self.network, processes.rank)
         self.learner = Learner(self.network, config, self.generator, replay=self._replay(size),
-                               processes=processes)
+                               processes=processes, beside=bags and bags.loss)
         # All processes see that a gradient is not finite, whosever batch it came from.
         self.learner.failed_batch = folder / (
             f'{processes.rank}-{FAILED_BATCH}' if processes.count > 1 else FAILED_BATCH)
@@ -202,7 +218,7 @@ class _Training:
         if self.processes.leads:
             if init is not None:
                 self.network.load_state_dict(_initial_weights(init, self.network))
-            elif self.config.pair_minutes and pairs is not None:
+            if self.config.pair_minutes and pairs is not None:
                 self._learn_pairs(*pairs())
         self.processes.copy_weights(self.network)
         self._begin()
@@ -225,11 +241,12 @@ class _Training:
     def _learn_pairs(self, source: PairSource, validation: PairSource) -> None:
         """Pre-train the encoder; its time counts."""
         def say(row: dict) -> None:
-            print(f'pairs {row["pairs"]:,} · {row["minutes"]:.1f} min · in unseen houses: '
+            print(f'pairs {row["pairs"]:,} · {row["minutes"]:.1f} min · on others: '
                   f'bearing {row["validation_bearing_deg"]:.0f} deg, heading '
                   f'{row["validation_heading_deg"]:.0f} deg, overlap '
                   f'{row["validation_overlap_accuracy"]:.0%}', flush=True)
-        config = PairConfig(minutes=self.config.pair_minutes)
+        config = PairConfig(minutes=self.config.pair_minutes,
+                            learning_rate=self.config.pair_learning_rate)
         self.network.cpu()  # where pairs are drawn
         pretrain_pairs(self.network, source, validation, self.folder / PAIRS, config, say)
         self.network.to(self.config.device)
@@ -263,7 +280,7 @@ class _Training:
             share)
 
     def update(self) -> dict:
-        """Collect one rollout, learn from it, and say how it went (the keys of `COLUMNS`).
+        """Collect one rollout, learn from it, and say how it went (the keys are `columns`).
 
         With `config.overlap` the next rollout is collected meanwhile, by the weights before this
         update.
@@ -272,6 +289,8 @@ class _Training:
         rollout, episodes = self.ahead or self.collect()
         self.ahead = None
         middle = time.monotonic()
+        if self.bags is not None:
+            self.bags.begin_update(self.progress)
         with contextlib.ExitStack() as stack:
             collecting = None
             if self.config.overlap:
@@ -308,7 +327,8 @@ class _Training:
             _mean(episode.decisions for episode in self.recent),
             sum(episode.collisions for episode in self.recent) / decisions,
             *(losses[name] for name in BASIC_LOSSES), middle - start, end - middle,
-            *(losses.get(name, math.nan) for name in TASKS)), strict=True))
+            *(losses.get(name, math.nan) for name in TASKS)), strict=True)) | (
+                {} if self.bags is None else self.bags.figures())
 
     def save(self, log: Log | None) -> None:
         """Write the training state, then the checkpoint; each whole or not at all."""
@@ -341,6 +361,10 @@ class _Training:
         self.recent.extend(Episode(*episode) for episode in state['recent'])
         self.frames, self.updates = state['frames'], state['updates']
         self.seconds = state['seconds']
+        if self.bags is not None:
+            self.bags.load_state_dict(state['bags'])
+        if state.get('shown goals') is not None:
+            self.env.recall_goals(state['shown goals'].numpy())
         words = [f'resumed at {self.frames:,} frames']
         if state['env'] is not None and self.processes.count == 1:
             self.generator.set_state(state['generator'])
@@ -389,6 +413,10 @@ class _Training:
             'recent': [tuple(episode) for episode in self.recent],
             'frames': self.frames, 'updates': self.updates, 'seconds': self.seconds,
             'env': env,
+            'bags': None if self.bags is None else self.bags.state_dict(),
+            # Of an environment that does not know its goals before it has seen them.
+            'shown goals': (torch.from_numpy(self.env.shown_goals.copy())
+                            if hasattr(self.env, 'shown_goals') else None),
             'replay': None if self.learner.replay is None else self.learner.replay.state_dict(),
         }
 
@@ -396,6 +424,7 @@ class _Training:
         """What must not change between save and resumption."""
         network = dataclasses.asdict(self.network.config)
         return {
+            'bags': None if self.bags is None else self.bags.identity,
             'action names': list(network.pop('actions')),
             'network': {key: list(value) if isinstance(value, tuple) else value
                         for key, value in network.items()},
@@ -417,8 +446,14 @@ class _Signals:
         self.event, self.before = threading.Event(), {}
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                self.before[number] = signal.signal(number, lambda *_: self.event.set())
+                self.before[number] = signal.signal(number, self._hear)
         return self.event
+
+    def _hear(self, number: int, frame) -> None:
+        self.event.set()
+        before = self.before[number]
+        if callable(before) and before is not signal.default_int_handler:
+            before(number, frame)  # an environment that drives a robot wants to know at once
 
     def __exit__(self, *_):
         for number, handler in self.before.items():

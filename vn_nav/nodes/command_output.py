@@ -31,6 +31,9 @@ class CommandOutput:
         period: between two commands [s].
         lock_step: one command for every odometry message instead.
         stamped: TwistStamped instead of Twist.
+        name: of the topic.
+        patience: time without odometry after which lock-step sends a command unasked [s]; None:
+            it never does.
 
     Attributes:
         publisher: of the commands.
@@ -39,18 +42,22 @@ class CommandOutput:
 
     def __init__(self, node, navigator: Navigator, wake: threading.Condition,
                  is_running: Callable[[], bool], *, period: float, lock_step: bool,
-                 stamped: bool):
+                 stamped: bool, name: str = 'cmd_vel', patience: float | None = 0.5):
         self._node, self._navigator, self._wake = node, navigator, wake
         self._is_running, self._period, self._in_lock_step = is_running, period, lock_step
-        self._stamped = stamped
-        self.publisher = node.create_publisher(TwistStamped if stamped else Twist, 'cmd_vel',
-                                               qos('cmd_vel'))
+        self._stamped, self._patience = stamped, patience
+        self.publisher = node.create_publisher(TwistStamped if stamped else Twist, name, qos(name))
         self.odometry: np.ndarray | None = None
         self._stamp = 0.0  # of the odometry
         self._rests = True  # says the odometry
         self._received = -math.inf
         self._count = 0
         self._robot_moves = False  # by the last command sent
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the newest odometry that was usable."""
+        return time.monotonic() - self._received
 
     def take_odometry(self, message: Odometry) -> None:
         """Keep the newest odometry; stop on numbers that are not finite."""
@@ -107,7 +114,8 @@ class CommandOutput:
         answered, moving, first = self._count, False, False
         while True:
             with self._wake:
-                self._wait_for_odometry(answered, or_decision=not moving, timeout=0.5)
+                self._wait_for_odometry(answered, or_decision=not moving,
+                                        timeout=self._patience)
                 if first and self._rests and self._count > answered:
                     self._wait_for_odometry(self._count, or_decision=False, timeout=CROSSING)
                 if not self._is_running():
@@ -120,7 +128,8 @@ class CommandOutput:
             if velocity is not None:
                 self.send(velocity)
 
-    def _wait_for_odometry(self, answered: int, *, or_decision: bool, timeout: float) -> None:
+    def _wait_for_odometry(self, answered: int, *, or_decision: bool, timeout: float | None
+                           ) -> None:
         self._wake.wait_for(
             lambda: not self._is_running() or self._count > answered
             or (or_decision and self._navigator.ready_to_move), timeout=timeout)

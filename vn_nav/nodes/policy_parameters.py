@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 
 from vn_nav.errors import UserError
@@ -10,7 +12,8 @@ from vn_nav.errors import UserError
 PARAMETERS = {
     'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),
     'robot': ('', 'YAML file of the robot; empty: the standard robot', None),
-    'mode': ('stop_and_go', 'stop_and_go, or continuous: a decision at every frame', None),
+    'mode': ('stop_and_go', 'stop_and_go; continuous: a decision at every frame; shadow: beside '
+                            'somebody else who drives, see docs/architecture.md', None),
     'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step', None),
     'image_transport': ('raw', 'raw, or compressed: image_raw/compressed', None),
     'enable_stamped_cmd_vel': (False, 'publish TwistStamped instead of Twist', None),
@@ -30,33 +33,34 @@ PARAMETERS = {
 }
 
 CHOICES = {
-    'mode': ('stop_and_go', 'continuous'),
+    'mode': ('stop_and_go', 'continuous', 'shadow'),
     'time': ('real_time', 'lock_step'),
     'image_transport': ('raw', 'compressed'),
     'decoding': ('', 'sample', 'greedy'),
 }
 
 
-def declare(node) -> None:
-    """Declare all parameters on a node."""
-    for name, (default, meaning, span) in PARAMETERS.items():
+def declare(node, names: Iterable[str] = tuple(PARAMETERS)) -> None:
+    """Declare parameters on a node."""
+    for name in names:
+        default, meaning, span = PARAMETERS[name]
         ranges = [FloatingPointRange(from_value=span[0], to_value=span[1])] if span else []
         node.declare_parameter(name, default, ParameterDescriptor(
             description=meaning, floating_point_range=ranges))
 
 
-def read(node) -> dict:
-    """All values by name.
+def read(node, names: Iterable[str] = tuple(PARAMETERS)) -> dict:
+    """Values by name.
 
     Raises:
         UserError: a word that is none of the choices, or a threshold that is no probability.
     """
-    values = {name: node.get_parameter(name).value for name in PARAMETERS}
+    values = {name: node.get_parameter(name).value for name in names}
     for name, allowed in CHOICES.items():
-        if values[name] not in allowed:
+        if name in values and values[name] not in allowed:
             raise UserError(f'{name} is one of {", ".join(a or "(empty)" for a in allowed)}',
                             values[name], f'set it with -p {name}:=...')
-    if -1.0 < values['stop_threshold'] < 0.0:
+    if -1.0 < values.get('stop_threshold', -1.0) < 0.0:
         raise UserError('stop_threshold lies in [0, 1], or is -1', values['stop_threshold'],
                         'set it with -p stop_threshold:=...')
     return values

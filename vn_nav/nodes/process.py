@@ -23,8 +23,8 @@ class Ended:
 
     def __init__(self):
         self._ended = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
+        self._before = {number: signal.signal(number, self._on_signal)
+                        for number in (signal.SIGINT, signal.SIGTERM)}
 
     def _on_signal(self, *_):
         self._ended = True
@@ -32,6 +32,11 @@ class Ended:
     def is_set(self) -> bool:
         """A signal has come."""
         return self._ended
+
+    def restore(self) -> None:
+        """Leave the signals to whoever heard them before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
 
 def run_node(name: str, make: Callable[[], Node], work: Callable[[Node, Ended], None],

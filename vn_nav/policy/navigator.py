@@ -79,6 +79,7 @@ class Navigator:
         self.goal_ready = False
         self.velocity = np.zeros(4)
         self.decisions = 0  # in this episode
+        self.cut_off = 0  # motions, or decisions to move, that were given up before their end
         self.arrival: float | None = None  # probability at which arrival was declared
         self.dropped: dict[str, int] = {}  # frames by reason
         self._target = np.zeros(4)
@@ -211,6 +212,7 @@ class Navigator:
 
     def _abandon(self) -> None:
         """Forget the action and the decision under way; velocity zero."""
+        self.cut_off += self.phase is Phase.MOVE or self._pending_action is not None
         self.phase, self.executor.action = Phase.LOOK, None
         self._ticket += 1
         self._inferring_since = self._pending_action = None
@@ -218,12 +220,16 @@ class Navigator:
 
     # Decisions, made by another thread.
 
+    def wants(self, stamp: float) -> bool:
+        """Whether a decision from a frame with this stamp is wanted."""
+        return (self.state is State.RUNNING and self.goal_ready
+                and self._inferring_since is None and stamp > self._look_after
+                and (self.phase is Phase.LOOK or self.continuous)
+                and self._pending_action is None)
+
     def request(self, stamp: float, now: float) -> int | None:
         """A ticket, when a decision from a frame with this stamp is wanted now."""
-        if (self.state is not State.RUNNING or not self.goal_ready
-                or self._inferring_since is not None or stamp <= self._look_after
-                or (self.phase is Phase.MOVE and not self.continuous)
-                or self._pending_action is not None):
+        if not self.wants(stamp):
             return None
         self._inferring_since = now
         return self._ticket

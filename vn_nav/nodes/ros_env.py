@@ -1,0 +1,233 @@
+"""Robots on ROS topics as a vector environment: the learner cannot tell it from a simulator.
+
+`vn_nav train --env ros`. What each robot does, and when it stands still, is
+`vn_nav.nodes.ros_robot`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import ParameterException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from vn_nav.errors import EnvironmentLost, UserError
+from vn_nav.nodes.process import Ended
+from vn_nav.nodes.ros_robot import BESIDE, RosRobot, Seen
+from vn_nav.robot import RobotSpec
+
+GOALS = 1024  # different goal pictures of a training
+RECORDED = 'recorded'  # world version of pictures from no simulator
+
+
+class RosEnv:
+    """Visual navigation of real robots, or of simulated ones behind topics; used as a context.
+
+    It observes and tells as `vn_sim_bridge.env.NavigationEnv` does, as far as topics know:
+    `info` has `reset`, `success`, `collided`, `arrived` and, where they are published and asked
+    for, `depth` and `segmentation`. An episode ends as `episode_end` says; with a reward above 0,
+    or `arrived`; where nobody publishes `episode_end` after `max_decisions`; with another
+    goal picture; and when a motion was broken off. The next one begins with the next
+    picture on `goal_image`, or after a truncation that nobody announced with the same one again.
+    Between two steps, as while a learner learns, the robots stand still under zero commands.
+
+    The last observation of an episode is the picture after its last decision; if the next goal
+    has come by then (a simulator puts its robot elsewhere at once) it is the one before.
+
+    Args:
+        robot: with the actions of the policy.
+        size: side of the pictures [pixels].
+        namespaces: one for each robot.
+        lock_step: the other side is `sim_bridge_node` with time:=lock_step.
+        max_decisions: see above.
+        collision_reward: for a decision that touched something, negative.
+        record: folder of a new bag; of several robots: of their bags.
+        ros_arguments: what may follow `--ros-args`: remappings and parameters of the nodes.
+
+    Attributes:
+        goals: [1024,3,S,S] the goal pictures seen so far, then empty ones.
+        offers: keys of `info` beyond the first three that the topics can give.
+        privileged: those that `info` shall have, once `listen` was called.
+        steps, seconds: decisions, and the time spent on driving them.
+
+    Raises:
+        UserError: topics that are missing, or something on them that does not fit.
+    """
+
+    def __init__(self, robot: RobotSpec, size: int, *, namespaces: Sequence[str] = ('',),
+                 lock_step: bool = False, max_decisions: int = 300,
+                 collision_reward: float = 0.0, record: Path | None = None,
+                 ros_arguments: Sequence[str] = ()):
+        self.robot, self.num_envs = robot, len(namespaces)
+        self.action_names = robot.action_names
+        self.goals = np.zeros((GOALS, 3, size, size), np.uint8)
+        self._numbers: dict[bytes, int] = {}  # of goals, by their bytes
+        self.privileged: tuple[str, ...] = ()
+        self._collision_reward = collision_reward
+        self.steps, self.seconds = 0, 0.0
+        n = self.num_envs
+        self._done = np.zeros(n, bool)
+        self._goal_index = np.zeros(n, np.int64)
+        self._last_action = np.full(n, -1, np.int64)
+        self._last_reward = np.zeros(n, np.float32)
+        self._ended = Ended()
+        self._closing = False
+        self._context = Context()
+        self._robots: list[RosRobot] = []
+        self._thread: threading.Thread | None = None
+        try:
+            self._start(namespaces, ros_arguments, record, {
+                'robot': robot, 'size': size, 'lock_step': lock_step,
+                'max_decisions': max_decisions, 'ended': self._ended})
+        except BaseException:
+            self.close()
+            raise
+        present = set.intersection(*(one.offers() for one in self._robots))
+        # In lock-step nobody sees the place of an arrival: the robot is put elsewhere at once.
+        self.offers = tuple(sorted(present | (set() if lock_step else {'arrived'})))
+
+    def _start(self, namespaces: Sequence[str], arguments: Sequence[str], record: Path | None,
+               options: dict) -> None:
+        words = ['--ros-args', *arguments] if arguments else []
+        try:
+            # rclpy's own handlers would close the context before the last zero is out.
+            rclpy.init(args=words, context=self._context,
+                       signal_handler_options=SignalHandlerOptions.NO)
+            self._executor = SingleThreadedExecutor(context=self._context)
+            for name in namespaces:
+                bag = record if record is None or len(namespaces) == 1 else record / name
+                self._robots.append(RosRobot(self._context, name, bag=bag, **options))
+                self._executor.add_node(self._robots[-1])
+        except (RuntimeError, ValueError, ParameterException) as error:  # of words that it refuses
+            raise UserError('namespaces and --ros-args are as ROS wants them',
+                            ' '.join([*namespaces, *words]), str(error).splitlines()[0]) from error
+        self._thread = threading.Thread(target=self._spin, name='executor', daemon=True)
+        self._thread.start()
+        for one in self._robots:
+            one.connect()
+
+    def __enter__(self) -> RosEnv:
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def close(self) -> None:
+        """Zero first, delivered; then everything else."""
+        for one in self._robots:
+            one.halt()
+        self._closing = True
+        if self._thread is not None:
+            self._thread.join(timeout=2.0)
+        for one in self._robots:
+            one.destroy_node()
+        self._robots = []
+        rclpy.try_shutdown(context=self._context)
+        self._ended.restore()
+
+    @property
+    def scene(self) -> dict:
+        """What the first robot's simulator says of its house; empty: there is none."""
+        return self._robots[0].scene
+
+    @property
+    def world_version(self) -> str:
+        """Of the simulators; `RECORDED` for robots, or for several worlds."""
+        worlds = {str(one.scene.get('world_version', RECORDED)) for one in self._robots}
+        return worlds.pop() if len(worlds) == 1 else RECORDED
+
+    @property
+    def shown_goals(self) -> np.ndarray:
+        """The goal pictures seen so far [G,3,S,S]: a training saves them."""
+        return self.goals[:len(self._numbers)]
+
+    def recall_goals(self, pictures: np.ndarray) -> None:
+        """Number goals as an earlier training did; before `reset`."""
+        self._numbers.clear()
+        for picture in pictures:
+            self._number(picture)
+
+    def listen(self, privileged: Sequence[str]) -> None:
+        """Have these of `offers` in `info`."""
+        self.privileged = tuple(privileged)
+        for one in self._robots:
+            one.listen(tuple(key for key in privileged if key in BESIDE))
+
+    def set_difficulty(self, tau: float) -> None:
+        """Do nothing: where a robot starts is not for its policy's trainer to say."""
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Begin episodes where the robots stand."""
+        seen = [self._begin(n) for n in range(self.num_envs)]
+        none = np.zeros(self.num_envs, bool)
+        self._done[:] = False
+        return self._observe(seen), self._tell(seen, ~none, none, none, none)
+
+    def step(self, actions):
+        """One decision of every robot whose episode goes on; the others begin the next one."""
+        begun, reset = time.monotonic(), self._done.copy()
+        for one, action, resets in zip(self._robots, actions, reset, strict=True):
+            if not resets:
+                one.drive(int(action))
+        n = self.num_envs
+        reward = np.zeros(n, np.float32)
+        success, collided, arrived, terminated, truncated = (np.zeros(n, bool) for _ in range(5))
+        seen: list[Seen] = []
+        for k, one in enumerate(self._robots):
+            if reset[k]:
+                seen.append(self._begin(k))
+                continue
+            outcome = one.finish()
+            seen.append(outcome.seen)
+            reward[k] = outcome.reward + self._collision_reward * outcome.collided
+            self._last_action[k], self._last_reward[k] = actions[k], outcome.reward
+            success[k], collided[k] = outcome.success, outcome.collided
+            terminated[k], truncated[k] = outcome.terminated, outcome.truncated
+            arrived[k] = outcome.success and not outcome.stale
+        self._done = terminated | truncated
+        self.steps += int((~reset).sum())
+        self.seconds += time.monotonic() - begun
+        return (self._observe(seen), reward, terminated, truncated,
+                self._tell(seen, reset, success, collided, arrived))
+
+    def _begin(self, k: int) -> Seen:
+        seen = self._robots[k].begin()
+        self._goal_index[k] = self._number(self._robots[k].goal)
+        self._last_action[k], self._last_reward[k] = -1, 0.0
+        return seen
+
+    def _number(self, picture: np.ndarray) -> int:
+        """Place of a goal picture in the table."""
+        number = self._numbers.setdefault(picture.tobytes(), len(self._numbers))
+        if number == GOALS:
+            raise EnvironmentLost(f'a training has at most {GOALS} different goal pictures',
+                                  'one more', 'go on with a new training: --init')
+        self.goals[number] = picture
+        return number
+
+    def _observe(self, seen: list[Seen]) -> dict[str, np.ndarray]:
+        return {'image': np.stack([one.picture for one in seen]),
+                'goal_index': self._goal_index.copy(), 'last_action': self._last_action.copy(),
+                'last_reward': self._last_reward.copy()}
+
+    def _tell(self, seen: list[Seen], reset, success, collided, arrived) -> dict[str, np.ndarray]:
+        told = {key: np.stack([one.beside[key] for one in seen]) for key in self.privileged
+                if key in BESIDE}
+        return {'reset': reset, 'success': success, 'collided': collided, 'arrived': arrived,
+                **told}
+
+    def _spin(self) -> None:
+        """Serve all robots; a callback that fails stops them."""
+        try:
+            while not self._closing:
+                self._executor.spin_once(timeout_sec=0.1)
+        except Exception as error:  # whatever it was: zero first
+            for one in self._robots:
+                one.fail(f'a callback failed: {error!r}')

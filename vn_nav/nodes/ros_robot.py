@@ -1,0 +1,569 @@
+"""One robot behind topics, driven a decision at a time: what training over ROS consists of.
+
+Threads: the executor decodes what comes in; the output thread (`vn_nav.nodes.command_output`)
+alone publishes commands, and zero whenever no decision is being driven; whoever trains waits in
+`drive`, `finish` and `begin`. What stops the robot is `vn_nav.policy.navigator`'s matter, as in
+policy_node; but nobody has to enable it again: it goes on by itself when the cause is gone.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import json
+import math
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Bool, Float32, Int8, String, UInt8
+from std_srvs.srv import Trigger
+
+from vn_msgs_py import images
+from vn_msgs_py.topics import VOLATILE, topic
+from vn_nav.bags.drive import WINDOW
+from vn_nav.bags.recorder import BagWriter, RecordingStopped
+from vn_nav.errors import EnvironmentLost, UserError
+from vn_nav.nodes import policy_parameters
+from vn_nav.nodes.command_output import CommandOutput
+from vn_nav.nodes.process import Ended
+from vn_nav.nodes.qos import profile, qos
+from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
+from vn_nav.policy.navigator import ENABLED, STOP_SECONDS, Limits, Navigator, State
+from vn_nav.robot import RobotSpec
+
+NAME = 'training_node'
+PARAMETERS = ('image_transport', 'enable_stamped_cmd_vel', 'control_rate', 'frame_timeout',
+              'frame_stop_timeout', 'max_frame_age', 'max_frame_ahead', 'settle_time')
+PATIENCE = 120.0  # s, default of the parameter `patience`
+LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step, as in policy_node
+VERDICT = 2.0  # s that the end of a decision in lock-step waits for its judge
+LOOK = 0.05  # s between looks for a signal
+QUIET = 1.0  # s of waiting about which nothing is said
+WATCH = 0.25  # s between looks for other publishers
+TERMINATED, TRUNCATED = 1, 2  # on `episode_end`
+# Beside the picture, by the key of `info`: topic and decoder.
+BESIDE = {'depth': ('depth/image_raw', images.decode_depth),
+          'segmentation': ('labels/image_raw', images.decode_labels)}
+
+
+class Seen(NamedTuple):
+    """What the robot sees at rest."""
+
+    picture: np.ndarray  # [3,S,S] uint8
+    beside: dict[str, np.ndarray]  # [S,S] depth [m], 0 where unknown; segmentation class ids
+
+
+class Outcome(NamedTuple):
+    """What came of a decision."""
+
+    seen: Seen
+    reward: float  # of the task
+    success: bool
+    collided: bool
+    terminated: bool
+    truncated: bool
+    # What is seen is from before the decision: the robot has been put elsewhere meanwhile.
+    stale: bool
+
+
+@dataclasses.dataclass
+class Tally:
+    """What was said on topics since the last decision."""
+
+    reward: float = 0.0
+    judged: bool = False  # somebody said something on `reward`
+    collided: bool = False
+    arrived: bool = False
+    end: int = 0
+
+
+class RosRobot(Node):
+    """A robot that a training drives.
+
+    Args:
+        context: of rclpy.
+        namespace: of the topics; empty: none.
+        robot: with the actions of the policy, in its order.
+        size: side of the pictures [pixels].
+        lock_step: answer every odometry message (`vn_sim_bridge` with time:=lock_step).
+        max_decisions: of an episode, where nobody publishes `episode_end`.
+        ended: a signal has come.
+        bag: folder to record into; None: nowhere.
+
+    Attributes:
+        goal: the goal picture in force [3,S,S].
+        scene: what a simulator says of itself; empty: nobody does.
+    """
+
+    def __init__(self, context: Context, namespace: str, robot: RobotSpec, size: int, *,
+                 lock_step: bool, max_decisions: int, ended: Ended, bag: Path | None):
+        super().__init__(NAME, namespace=namespace or None, context=context)
+        policy_parameters.declare(self, PARAMETERS)
+        self.patience = self.declare_parameter('patience', PATIENCE, ParameterDescriptor(
+            description='without a picture, a goal or leave to move a training ends after [s]',
+            floating_point_range=[FloatingPointRange(from_value=1.0, to_value=1e6)])).value
+        value = policy_parameters.read(self, PARAMETERS)
+        self.robot, self.size, self.lock_step = robot, size, lock_step
+        self.max_decisions, self.ended = max_decisions, ended
+        self.wake = threading.Condition()  # guards everything below, and wakes all threads
+        limits = (Limits(LOCK_STEP_LIMIT, LOCK_STEP_LIMIT, settle_time=0.0) if lock_step else
+                  Limits(**{name: value[name] for name in Limits.__dataclass_fields__
+                            if name in value}))
+        self.navigator = Navigator(robot, limits, exact=lock_step)
+        self.output = CommandOutput(
+            self, self.navigator, self.wake, lambda: self._running,
+            period=1.0 / value['control_rate'], lock_step=lock_step,
+            stamped=value['enable_stamped_cmd_vel'])
+        self.camera_fov: float | None = None
+        self.goal: np.ndarray | None = None
+        self.scene: dict = {}
+        self.failure: str = ''  # of a thread
+        self._running = self._held = False
+        self._goals = 0  # that were taken
+        self._frame: tuple[float, np.ndarray] | None = None  # the newest, of the present goal
+        self._beside: dict[str, collections.deque] = {}  # (stamp, message) by key
+        self._tally = Tally()
+        self._shown: Seen | None = None
+        self._episode_goal = 0  # number of the goal that the episode began with
+        self._awaits_goal = False
+        self._decisions = self._cut_before = 0
+        self._stopped_since: float | None = None
+        self._writer = BagWriter(bag) if bag is not None else None
+        self._make_interfaces(value['image_transport'] == 'compressed')
+        self._thread = threading.Thread(target=self._guard, name='output', daemon=True)
+
+    # Interfaces. Outcomes come first: of what has arrived, the executor serves the oldest
+    # subscription first, and so the outcome of a decision before the picture that follows it.
+
+    def _make_interfaces(self, compressed: bool) -> None:
+        self._hear(Float32, 'reward', self._on_reward, history=False)
+        self._hear(Bool, 'collision', self._on_collision, history=False)
+        self._hear(Bool, 'arrived', self._on_arrived, history=False)
+        self._hear(UInt8, 'episode_end', self._on_episode_end, history=False)
+        self._hear(String, 'scene', self._on_scene)
+        self._hear(Image, 'goal_image', self._on_goal)
+        self._hear(Odometry, 'odom', self.output.take_odometry)
+        self._hear(CameraInfo, 'camera_info', self._on_camera_info)
+        self._hear(*((CompressedImage, 'image_raw/compressed') if compressed else
+                     (Image, 'image_raw')), self._on_image)
+        self._action, names = (self.create_publisher(kind, name, qos(name)) for kind, name in (
+            (Int8, 'action'), (String, 'action_names')))
+        self._say(names, 'action_names', String(data=json.dumps(self.robot.action_names)))
+        if self._writer is not None:  # what this node publishes itself, as everybody hears it
+            entry = topic('cmd_vel')
+            kind = self.output.publisher.msg_type
+            self._writer.add(dataclasses.replace(
+                entry, type=f'geometry_msgs/msg/{kind.__name__}'))
+            self.create_subscription(kind, 'cmd_vel', self._recording('cmd_vel'), qos('cmd_vel'))
+        self.create_service(Trigger, '~/stop', self._on_stop)
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_timer(WATCH, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _hear(self, kind: type, name: str, handle: Callable[[Any], None], *,
+              history: bool = True) -> None:
+        """Subscribe to a topic of the contract.
+
+        Args:
+            kind: of the messages.
+            name: of the topic.
+            handle: called with each.
+            history: also what was said before, where the topic keeps it.
+        """
+        entry = topic(name)
+        record = self._recording(name)
+        if self._writer is not None:
+            self._writer.add(entry)
+
+        def callback(message, info) -> None:
+            record(message, info)
+            handle(message)
+        self.create_subscription(kind, name, callback, profile(
+            entry if history else dataclasses.replace(entry, durability=VOLATILE)))
+
+    def _recording(self, name: str) -> Callable[[Any, dict], None]:
+        def record(message, info) -> None:
+            self._record(name, message, info['source_timestamp'],
+                         info.get('publication_sequence_number') or 0)
+        return record
+
+    def _record(self, name: str, message: Any, stamp: int = 0, number: int = 0) -> None:
+        """Into the bag, if there is one; a disk that is full ends the recording alone."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.write(name, serialize_message(message), stamp or time.time_ns(),
+                               number)
+        except RecordingStopped as error:
+            self._writer = None
+            self.get_logger().error(f'recording stopped: {error}')
+
+    def _say(self, publisher, name: str, message: Any) -> None:
+        publisher.publish(message)
+        if self._writer is not None:
+            self._writer.add(topic(name))
+        self._record(name, message)
+
+    def listen(self, keys: tuple[str, ...]) -> None:
+        """Have these keys of `BESIDE` beside every picture."""
+        for key in keys:
+            self._beside[key] = collections.deque(maxlen=16)
+
+            def keep(message, rows=self._beside[key]) -> None:
+                with self.wake:
+                    rows.append((_seconds(message.header.stamp), message))
+                    self.wake.notify_all()
+            self._hear(Image, BESIDE[key][0], keep)
+
+    def offers(self) -> set[str]:
+        """The keys of `BESIDE` that somebody publishes."""
+        return {key for key, (name, _) in BESIDE.items() if self.count_publishers(name)}
+
+    # Callbacks, on the executor's thread.
+
+    def _on_image(self, message) -> None:
+        stamp = _seconds(message.header.stamp)
+        with self.wake:
+            # In lock-step stamps are the simulator's ticks and nothing is late.
+            if not self.navigator.admit(stamp, None if self.lock_step else self._now()):
+                return
+        try:
+            picture = self._prepare(message)
+        except (images.ImageError, UserError) as error:
+            with self.wake:
+                self.navigator.bad_frame(str(error), time.monotonic())
+            return
+        with self.wake:
+            self.navigator.good_frame(time.monotonic())
+            self._frame = (stamp, picture)
+            self.wake.notify_all()
+
+    def _on_goal(self, message: Image) -> None:
+        stamp = message.header.stamp
+        with self.wake:
+            if not self.navigator.new_goal((stamp.sec, stamp.nanosec)):
+                return
+        try:
+            picture = self._prepare(message)
+        except (images.ImageError, UserError) as error:
+            self.get_logger().error(f'goal_image refused: {error}')
+            with self.wake:
+                self.navigator.refuse_goal()
+            return
+        with self.wake:
+            # Pictures up to then belong to the episode before.
+            self.navigator.accept_goal(_seconds(stamp) if self.lock_step else
+                                       self._now() + self.navigator.limits.settle_time)
+            self.goal, self._frame = picture, None
+            self._goals += 1
+            self.wake.notify_all()
+
+    def _on_reward(self, message: Float32) -> None:
+        if not math.isfinite(message.data):
+            self.get_logger().error(f'a reward is finite; received {message.data}')
+            return
+        with self.wake:
+            self._tally.reward += message.data
+            self._tally.judged = True
+            self.wake.notify_all()
+
+    def _on_collision(self, message: Bool) -> None:
+        with self.wake:
+            self._tally.collided |= message.data
+
+    def _on_arrived(self, message: Bool) -> None:
+        with self.wake:
+            self._tally.arrived |= message.data
+
+    def _on_episode_end(self, message: UInt8) -> None:
+        with self.wake:
+            self._tally.end = message.data
+
+    def _on_scene(self, message: String) -> None:
+        try:
+            said = json.loads(message.data)
+        except ValueError:  # another kind of scene
+            return
+        if isinstance(said, dict):
+            self.scene = said
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        side, focal = min(message.width, message.height), message.k[0]
+        if side > 0 and math.isfinite(focal) and focal > 0:
+            self.camera_fov = 2 * math.atan(side / 2 / focal)
+
+    def _on_stop(self, _request, response):
+        with self.wake:
+            self._held = True
+            self.navigator.stop('~/stop was called', time.monotonic())
+            self.wake.notify_all()
+        response.success, response.message = True, 'stopped: ~/reset to go on'
+        return response
+
+    def _on_reset(self, _request, response):
+        with self.wake:
+            self._held = False
+        response.success, response.message = True, 'the training goes on'
+        return response
+
+    def _watch(self) -> None:
+        """Four times a second: intruders on the command topic."""
+        if others := self._other_publishers():
+            with self.wake:
+                if self.navigator.state in ENABLED:
+                    self.navigator.stop(f'{others} other publisher(s) on cmd_vel',
+                                        time.monotonic())
+                    self.wake.notify_all()
+
+    # What is asked of it, in turn: begin, then drive and finish until the episode ends.
+
+    def connect(self) -> None:
+        """Wait for camera, odometry, goal and base, then publish commands: zero, for now.
+
+        Raises:
+            UserError: one of them is missing, another node publishes commands, or the camera sees
+                less than the robot's.
+        """
+        if others := self._other_publishers():
+            raise UserError('this node alone publishes its command topic', f'{others} more '
+                            f'publisher(s) on {self.output.publisher.topic_name}',
+                            'end the other node, or remap one of them')
+        self._until(lambda: not self._missing(), lambda: f'waits for {", ".join(self._missing())}')
+        if self.camera_fov is not None:
+            crop_fraction(self.camera_fov, self.robot.camera_fov)
+        self._running = True
+        self._thread.start()
+
+    def _missing(self) -> list[str]:
+        found = (('image_raw', self._frame is not None),
+                 ('odom', self.output.odometry is not None),
+                 ('goal_image', self.goal is not None),
+                 (f'somebody {self._listener_words()}', self._listeners()),
+                 ('scene', self.scene or not self.count_publishers('scene')))
+        return [name for name, there in found if not there]
+
+    def begin(self) -> Seen:
+        """Begin an episode: what the robot sees, once there is a goal and it may move."""
+        def ready() -> bool:
+            if self._awaits_goal and self._goals == self._episode_goal:
+                return False
+            return self._sees()
+        self._until(ready, lambda: 'waits for the next picture on goal_image'
+                    if self._awaits_goal and self._goals == self._episode_goal else '')
+        with self.wake:
+            self._tally = Tally()
+            self._episode_goal, self._awaits_goal, self._decisions = self._goals, False, 0
+            self._shown = self._look()
+        return self._shown
+
+    def drive(self, action: int) -> None:
+        """Begin an action as soon as the robot may move."""
+        def taken() -> bool:
+            now = time.monotonic()
+            if self._frame is None or (
+                    ticket := self.navigator.request(self._frame[0], now)) is None:
+                return False
+            self.navigator.decided(ticket, action, now)
+            self._cut_before = self.navigator.cut_off
+            return True
+        self._until(taken)
+        with self.wake:
+            self.wake.notify_all()
+        self._decisions += 1
+        self._say(self._action, 'action', Int8(data=action))
+
+    def finish(self) -> Outcome:
+        """Wait until the motion is over and seen: what came of it."""
+        at_rest = None
+
+        def over() -> bool:
+            nonlocal at_rest
+            if not self._sees():
+                return False
+            at_rest = at_rest or time.monotonic()
+            # In lock-step a judge speaks before the picture; one that lost its word is not
+            # waited for.
+            return (not self.lock_step or self._tally.judged
+                    or time.monotonic() - at_rest > VERDICT)
+        self._until(over)
+        with self.wake:
+            said, self._tally = self._tally, Tally()
+            elsewhere = self._goals != self._episode_goal
+            cut = self.navigator.cut_off != self._cut_before
+            seen = self._shown if elsewhere else self._look()
+        success = said.reward > 0 or said.arrived
+        terminated = success or said.end == TERMINATED
+        limit = self._decisions >= self.max_decisions and not self.count_publishers('episode_end')
+        truncated = not terminated and (said.end == TRUNCATED or elsewhere or cut or limit)
+        self._awaits_goal = terminated or said.end == TRUNCATED
+        self._shown = seen
+        return Outcome(seen, said.reward or float(said.arrived), success, said.collided,
+                       terminated, truncated, stale=elsewhere)
+
+    def halt(self) -> None:
+        """End the output thread with a zero command that has been delivered; end the bag."""
+        with self.wake:
+            running, self._running = self._running, False
+            self.navigator.stop('the training ends', time.monotonic())
+            self.wake.notify_all()
+        if running:
+            self._thread.join(timeout=1.0)
+            self.output.deliver_zero()  # the output thread is gone: still only one owner
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            try:
+                writer.close()
+            except RecordingStopped as error:
+                self.get_logger().error(f'recording stopped: {error}')
+
+    def fail(self, words: str) -> None:
+        """Something broke that nobody expected: zero, and no more training."""
+        with self.wake:
+            self.failure = self.failure or words
+            self.navigator.stop(words, time.monotonic())
+            self.wake.notify_all()
+
+    # Waiting.
+
+    def _until(self, ready: Callable[[], bool], words: Callable[[], str] = lambda: '') -> None:
+        """Wait until something holds, and on the way go on from what stopped by itself.
+
+        Args:
+            ready: called with `wake` held.
+            words: what is waited for, where it is nothing that stopped the robot.
+
+        Raises:
+            EnvironmentLost: a signal, a failure, or `patience` is over.
+        """
+        begun, said = time.monotonic(), ''
+        with self.wake:
+            while True:
+                now = time.monotonic()
+                self._check(now)
+                if ready():
+                    break
+                why = words() or self._go_on(now)
+                if now - begun > self.patience:
+                    self.navigator.stop('the training has no more patience', now)
+                    raise EnvironmentLost(
+                        f'a robot is ready again within {self.patience:g} s (parameter patience)',
+                        f'{self._who()}{why or "no picture after the motion"}',
+                        'see to it, and resume the training: what was learned is saved')
+                if now - begun > QUIET and why and why != said:
+                    said = why
+                    print(f'{self._who()}paused: {why}', flush=True)
+                self.wake.wait(LOOK)
+        if said:
+            print(f'{self._who()}goes on after {time.monotonic() - begun:.1f} s', flush=True)
+
+    def _check(self, now: float) -> None:
+        if self.ended.is_set():
+            self.navigator.stop('a signal', now)
+            self.wake.notify_all()
+            raise EnvironmentLost('a training goes on until a signal', 'one', 'resume it')
+        if self.failure:
+            raise EnvironmentLost('the threads of a robot work', f'{self._who()}{self.failure}',
+                                  'resume the training: what was learned is saved')
+
+    def _go_on(self, now: float) -> str:
+        """Enable motion again as soon as nothing is in the way; what is, in words."""
+        navigator = self.navigator
+        if navigator.state is State.STOPPED:
+            self._stopped_since = self._stopped_since or now
+            if now - self._stopped_since < STOP_SECONDS or self._blockers():  # zero is repeated
+                return navigator.reason
+            navigator.reset()
+        self._stopped_since = None
+        if navigator.state is State.IDLE:
+            enabled, words = navigator.enable(now, self._blockers())
+            return '' if enabled else words
+        return navigator.reason
+
+    def _blockers(self) -> tuple[str, ...]:
+        if not self._running:
+            return ()
+        rules = (
+            (self._held, '~/stop was called: call ~/reset'),
+            (self._other_publishers(), 'another node publishes on cmd_vel: end it, or remap one'),
+            (self.output.silence > self.navigator.limits.frame_timeout, 'odometry is silent'),
+            (not self._listeners(), f'nobody is {self._listener_words()}'),
+        )
+        return tuple(words for broken, words in rules if broken)
+
+    def _sees(self) -> bool:
+        """Whether there is a picture to decide on, and what belongs beside it."""
+        return (self._frame is not None and self.navigator.wants(self._frame[0])
+                and all(_nearest(rows, self._frame[0]) for rows in self._beside.values()))
+
+    def _look(self) -> Seen:
+        stamp, picture = self._frame
+        beside = {}
+        for key, rows in self._beside.items():
+            decoded = BESIDE[key][1](_nearest(rows, stamp))
+            beside[key] = np.nan_to_num(preprocess_map(decoded, self.size, **self._lens()))
+        return Seen(picture, beside)
+
+    def _prepare(self, message) -> np.ndarray:
+        lens = self._lens()
+        smallest = needed_side(self.size, **lens)
+        return preprocess(images.decode_rgb(message, smallest), self.size, **lens)
+
+    def _lens(self) -> dict[str, float]:
+        return {} if self.camera_fov is None else {
+            'fov': self.camera_fov, 'target_fov': self.robot.camera_fov}
+
+    def _now(self) -> float:
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def _who(self) -> str:
+        namespace = self.get_namespace().strip('/')
+        return f'{namespace}: ' if namespace else ''
+
+    def _other_publishers(self) -> int:
+        return max(0, self.count_publishers(self.output.publisher.topic_name) - 1)
+
+    def _listeners(self) -> list:
+        """Who else listens for the commands, in the type in which they are sent."""
+        mine = f'geometry_msgs/msg/{self.output.publisher.msg_type.__name__}'
+        me = (self.get_name(), self.get_namespace())
+        return [info for info in
+                self.get_subscriptions_info_by_topic(self.output.publisher.topic_name)
+                if info.topic_type == mine and (info.node_name, info.node_namespace) != me]
+
+    def _listener_words(self) -> str:
+        kind = self.output.publisher.msg_type
+        other = TwistStamped if kind is Twist else Twist
+        return (f'listening for {kind.__name__} on cmd_vel (for {other.__name__} set '
+                f'enable_stamped_cmd_vel to {str(kind is Twist).lower()})')
+
+    def _guard(self) -> None:
+        """The output thread; when it fails, zero first."""
+        try:
+            self.output.run()
+        except Exception as error:  # whatever it was
+            self.fail(f'the output thread failed: {error!r}')
+            for _ in range(20):
+                self.output.send(np.zeros(4))
+                time.sleep(0.05)
+            raise
+
+
+def _seconds(stamp) -> float:
+    return stamp.sec + stamp.nanosec * 1e-9
+
+
+def _nearest(rows: collections.deque, stamp: float) -> Any:
+    """The message nearest to a stamp, within `WINDOW`; None: there is none."""
+    near = min(rows, key=lambda row: abs(row[0] - stamp), default=None)
+    return near[1] if near is not None and abs(near[0] - stamp) <= WINDOW else None
