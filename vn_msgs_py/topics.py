@@ -45,6 +45,11 @@ TOPICS = (
              'where to go; a new header stamp begins a new episode'),
     Topic('cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
           'velocity command; TwistStamped with enable_stamped_cmd_vel', depth=1),
+    Topic('shadow/cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
+          'mode shadow, in place of cmd_vel: no base listens there', depth=1),
+    Topic('executed_action', _STRING, 'user',
+          'mode shadow: JSON: the stamp of a picture where a decision is wanted, and the action '
+          'really done before it'),
     Topic('odom', 'nav_msgs/msg/Odometry', 'robot', 'wheel odometry; actions are closed on it'),
     _history('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
     _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),

@@ -64,11 +64,14 @@ class Processes:
             'OMP_NUM_THREADS': '1', 'PYTHONUNBUFFERED': '1',
         }
 
-    def start(self, name: str, module: str, parameters: dict) -> None:
-        """Start a node of this package with parameters."""
+    def start(self, name: str, module: str, parameters: dict, rules: tuple[str, ...] = ()
+              ) -> None:
+        """Start a node of this package with parameters and remapping rules."""
         words = [sys.executable, '-m', module, '--ros-args']
         for key, value in parameters.items():
             words += ['-p', f'{key}:={json.dumps(value)}']
+        for rule in rules:
+            words += ['-r', rule]
         log = open(self.logs / f'{name}.log', 'w')
         self.running[name] = subprocess.Popen(
             words, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,

@@ -30,6 +30,7 @@ class DecisionWorker:
         wake: guards the navigator and what this object keeps.
         is_running: false ends `run`.
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
+        shadow: decide only where `tell` says so, for a robot that somebody else drives.
 
     Attributes:
         camera_fov: field of view of the camera [rad], as far as it is known.
@@ -37,9 +38,13 @@ class DecisionWorker:
     """
 
     def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
-                 wake: threading.Condition, is_running: Callable[[], bool], *, lock_step: bool):
+                 wake: threading.Condition, is_running: Callable[[], bool], *, lock_step: bool,
+                 shadow: bool = False):
         self._node, self._navigator, self._runtime = node, navigator, runtime
         self._wake, self._is_running, self._lock_step = wake, is_running, lock_step
+        self._shadow = shadow
+        self._told: tuple[float, int] | None = None  # what `tell` was told
+        self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
         self.camera_fov: float | None = None
         self._frame: tuple | None = None  # the newest message and its stamp
         self._goal: Image | None = None
@@ -53,13 +58,30 @@ class DecisionWorker:
     def show_frame(self, message, stamp: float) -> None:
         """The newest admitted picture; one before it that still waits is dropped."""
         with self._wake:
-            self._frame = (message, stamp)
+            self._frame = self._shown = (message, stamp)
             self._wake.notify_all()
 
     def show_goal(self, message: Image) -> None:
         """The newest goal picture."""
         with self._wake:
             self._goal = message
+            self._wake.notify_all()
+
+    def tell(self, stamp: float, action: str | None) -> None:
+        """What the robot really did before the picture of a stamp, where a decision is wanted.
+
+        Args:
+            stamp: of the picture; a later one will do [s].
+            action: None: none of the policy's.
+
+        Raises:
+            ValueError: the policy does not know the action.
+        """
+        number = -1 if action is None else self._runtime.action_names.index(action)
+        with self._wake:
+            self._told = (stamp, number)
+            if self._frame is None and self._shown is not None and self._shown[1] >= stamp:
+                self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
 
     def check_fov(self) -> None:
@@ -120,9 +142,14 @@ class DecisionWorker:
         with self._wake:
             now = time.monotonic()
             self._navigator.good_frame(now)
+            if self._shadow and (self._told is None or stamp < self._told[0]):
+                return
             ticket = self._navigator.request(stamp, now)
-        if ticket is None:
-            return
+            if ticket is None:
+                return
+            if self._shadow:
+                self._runtime.correct(self._told[1])
+                self._told = None
         try:
             action = self._runtime.act(picture)
         except FloatingPointError as error:
@@ -130,8 +157,6 @@ class DecisionWorker:
                 self._navigator.stop(str(error), time.monotonic())
                 self._wake.notify_all()
             return
-        if not self._runtime.arrived:
-            self._action.publish(Int8(data=action))
         with self._wake:
             now = time.monotonic()
             if self._runtime.arrived:
@@ -139,6 +164,9 @@ class DecisionWorker:
                 self.tell_arrival()
             else:
                 self._navigator.decided(ticket, action, now)
+                # Still holding the lock: whoever hears of it finds it decided, and no command for
+                # it is out yet.
+                self._action.publish(Int8(data=action))
             self._wake.notify_all()
 
     def _prepare(self, message) -> np.ndarray:

@@ -9,6 +9,7 @@ Run: `ros2 run vn_nav policy_node --ros-args -p checkpoint:=models/house`.
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import threading
@@ -21,6 +22,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.errors import UserError
@@ -36,6 +38,7 @@ from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec, load_robot
 
 LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step
+SHADOW_LIMIT = 30.0  # s, the same in a shadow: nothing moves, and a busy machine may take its time
 
 
 class PolicyNode(LifecycleNode):
@@ -92,25 +95,34 @@ class PolicyNode(LifecycleNode):
                                 seed=value['seed'], decoding=value['decoding'] or None,
                                 stop_threshold=None if threshold < 0 else threshold)
         robot = robot.with_actions(runtime.action_names, runtime.moves)
+        shadow = value['mode'] == 'shadow'
         if self.lock_step:
-            limits = Limits(frame_timeout=LOCK_STEP_LIMIT, frame_stop_timeout=LOCK_STEP_LIMIT,
-                            inference_timeout=LOCK_STEP_LIMIT, settle_time=0.0)
+            limit = SHADOW_LIMIT if shadow else LOCK_STEP_LIMIT
+            limits = Limits(frame_timeout=limit, frame_stop_timeout=limit,
+                            inference_timeout=limit, settle_time=0.0)
         else:
             limits = Limits(**{name: value[name] for name in Limits.__dataclass_fields__})
-        self.navigator = Navigator(robot, limits, continuous=value['mode'] == 'continuous',
+        self.navigator = Navigator(robot, limits, continuous=value['mode'] != 'stop_and_go',
                                    exact=self.lock_step)
         self._output = CommandOutput(
             self, self.navigator, self._wake, lambda: self._running,
             period=1.0 / value['control_rate'], lock_step=self.lock_step,
-            stamped=value['enable_stamped_cmd_vel'])
+            stamped=value['enable_stamped_cmd_vel'],
+            # In a shadow nothing waits for commands: each answers odometry or a decision.
+            **({'name': 'shadow/cmd_vel', 'patience': None} if shadow else {}))
         self._worker = DecisionWorker(self, self.navigator, runtime, self._wake,
-                                      lambda: self._running, lock_step=self.lock_step)
-        self._make_interfaces(value['image_transport'] == 'compressed')
+                                      lambda: self._running, lock_step=self.lock_step,
+                                      shadow=shadow)
+        self._make_interfaces(value['image_transport'] == 'compressed', shadow)
 
-    def _make_interfaces(self, compressed: bool) -> None:
+    def _make_interfaces(self, compressed: bool, shadow: bool) -> None:
         self._diagnosis = Diagnosis(self, self._output.publisher, self.navigator.robot.name)
         image = 'image_raw/compressed' if compressed else 'image_raw'
+        told = [(self.destroy_subscription, self.create_subscription(
+            String, 'executed_action', self._on_executed_action, qos('executed_action')))
+        ] if shadow else []
         self._interfaces = [
+            *told,
             (self.destroy_subscription, self.create_subscription(
                 CompressedImage if compressed else Image, image, self._on_image, qos(image))),
             (self.destroy_subscription, self.create_subscription(
@@ -213,6 +225,15 @@ class PolicyNode(LifecycleNode):
         with self._wake:
             if self.navigator.new_goal(identity):
                 self._worker.show_goal(message)
+
+    def _on_executed_action(self, message: String) -> None:
+        try:
+            told = json.loads(message.data)
+            sec, nanosec = told['stamp']
+            self._worker.tell(sec + nanosec * 1e-9, told['action'])
+        except (ValueError, TypeError, KeyError) as error:
+            self.get_logger().error(f'executed_action is JSON with stamp [sec, nanosec] and an '
+                                    f"action's name or null; received {message.data!r}: {error!r}")
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         side, focal = min(message.width, message.height), message.k[0]

@@ -87,6 +87,16 @@ class PolicyRuntime:
         self._state = self._network.initial_state(1)
         self._last_action = -1
 
+    def correct(self, action: int) -> None:
+        """Say what was really done since `act`, where somebody else drives.
+
+        Args:
+            action: -1: none of the policy's. The memory is emptied then, as in pre-training: the
+                network cannot have been told of that motion.
+        """
+        if self._last_action >= 0:  # else an episode begins
+            self._last_action = action
+
     @property
     def arrived(self) -> bool:
         """Whether the policy declares, at the picture that `act` saw last, that it is there."""
@@ -142,6 +152,7 @@ class BatchedPolicy:
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
             the observation that `act` saw last; nan where the network has no such head.
+        logits: [N,A] tensor, of the actions at that observation; None before the first.
     """
 
     def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0):
@@ -149,6 +160,7 @@ class BatchedPolicy:
         self.network, self.decoding = network, decoding
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
+        self.logits: torch.Tensor | None = None
         self._state: RecurrentState = network.initial_state(num_envs)
         self._goals: np.ndarray | None = None
         self._goal_maps = GoalMaps(network)
@@ -184,7 +196,8 @@ class BatchedPolicy:
         output, self._state = self.network(observation, starts, self._state, maps)
         if output.arrival is not None:
             self.arrival = torch.sigmoid(output.arrival[0]).numpy()
-        return choose(output.logits[0], self.decoding, self._generator).numpy()
+        self.logits = output.logits[0]
+        return choose(self.logits, self.decoding, self._generator).numpy()
 
 
 def _check_decoding(decoding: str) -> None:
