@@ -221,10 +221,13 @@ def test_a_second_publisher_and_a_narrow_camera_are_refused(camera, checkpoint, 
     with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=checkpoint):
         camera.fov_focal = 84.0  # 53 degrees where the policy needs 90
         camera.show_goal()
-        end = time.monotonic() + 1.5
-        wait_until(lambda: time.monotonic() > end, camera.spin)
-        answer = camera.call(SetBool, 'enable', data=True)
-        assert not answer.success and 'deg' in answer.message
+
+        def refused_as_narrow():
+            camera.spin()
+            answer = camera.call(SetBool, 'enable', data=True)
+            assert not answer.success
+            return 'deg' in answer.message  # and not for what is not there yet
+        wait_until(refused_as_narrow, camera.spin)
         camera.fov_focal = 42.0
         end = time.monotonic() + 0.5
         wait_until(lambda: time.monotonic() > end, camera.spin)
