@@ -1,5 +1,6 @@
 """Losses of the auxiliary tasks against naive loops, and where their gradients go."""
 
+import dataclasses
 import math
 
 import pytest
@@ -192,6 +193,18 @@ def test_goal_pose_loss_counts_only_what_is_in_view():
         crossed.append(-math.log(probability if overlaps else 1 - probability))
     expected = sum(seen) / len(seen) + sum(crossed) / len(crossed)
     assert float(loss.detach()) == pytest.approx(expected, rel=1e-4)
+
+
+def test_where_nobody_knows_the_overlap_nothing_is_learned():
+    network = network_of()
+    rollout, latents = looked_at(network)
+    known = auxiliary.goal_pose_loss(latents, rollout)
+    half = torch.arange(6) < 3
+    unknown = dataclasses.replace(rollout, privileged={
+        **rollout.privileged, 'overlap': torch.where(half, rollout.privileged['overlap'], -1.0)})
+    part = dataclasses.replace(rollout, valid=rollout.valid & half)
+    loss = auxiliary.goal_pose_loss(latents, unknown)
+    assert torch.equal(loss, auxiliary.goal_pose_loss(latents, part)) and loss != known
 
 
 def test_arrival_distance_and_imitation():

@@ -148,6 +148,7 @@ MAY_RESIZE = {
     'vn_nav/observation.py', 'vn_sim_bridge/scene.py', 'vn_sim_bridge/houses/textures.py',
     'vn_sim_bridge/houses/contact_sheet.py', 'vn_sim_bridge/houses/walk.py',
     'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor.py',
+    'vn_nav/bags/show_figures.py',  # thumbnails for a page
 }
 
 

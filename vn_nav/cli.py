@@ -23,8 +23,15 @@ from vn_nav.evaluation.command import (
     evaluate,
     run_compare,
 )
-from vn_nav.learning.command import add_train_options, train_config, world_options
+from vn_nav.learning.command import (
+    add_train_options,
+    check_train_options,
+    config_over_ros,
+    train_config,
+    world_options,
+)
 from vn_nav.learning.pretrain_command import add_pretrain_options, run_pretrain
+from vn_nav.learning.teach import add_teach_options, teach
 
 BACKENDS = ('house',)
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
@@ -65,6 +72,11 @@ def build_parser() -> argparse.ArgumentParser:
     pretrained = commands.add_parser('pretrain', help='pre-train a policy on recorded bags')
     add_pretrain_options(pretrained)
     pretrained.set_defaults(run=run_pretrain)
+
+    taught = commands.add_parser(
+        'teach', help='learn the place where a bag was driven, in its pictures')
+    add_teach_options(taught)
+    taught.set_defaults(run=run_teach)
 
     measured = commands.add_parser('evaluate', help='measure a checkpoint')
     measured.add_argument('checkpoint', type=Path)
@@ -192,12 +204,12 @@ def run_collect(args) -> int:
 def run_train(args) -> int:
     """`vn_nav train`."""
     _check_backend(args.backend)
+    check_train_options(args)
+    if args.env == 'ros':
+        return _train_over_ros(args)
     from vn_nav.learning.trainer import train
     from vn_sim_bridge.env import PRIVILEGED
     from vn_sim_bridge.houses.splits import SPLITS
-    if args.house and args.houses:
-        raise UserError('a training is in named houses or in the first N', '--house and --houses',
-                        'give one of them')
     houses = args.house or list(SPLITS['train'][:args.houses or 1])
     config, world = train_config(args), world_options(args)
     env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
@@ -207,23 +219,86 @@ def run_train(args) -> int:
                    objects=args.objects, goals_per_room=args.goals_per_room,
                    goal_variants=args.goal_variants,
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
-    words = [word for word in sys.argv[1:] if word != '--resume']
-    info = {
+    bags = _bag_mix(args, config, env.robot)
+    info = _train_info(args, config, env, bags) | {
         'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
         'goals_per_room': args.goals_per_room, 'goal_variants': args.goal_variants,
-        'task': args.task, 'objects': args.objects, 'preset': args.preset,
-        'command': 'vn_nav ' + shlex.join(words),
-        'camera_fov_deg': math.degrees(env.robot.camera_fov),
-        'camera_height': env.robot.camera_height,
-        'notes': f'Trained on {machine(config.device)}, {config.threads} thread(s), '
-                 f'{datetime.date.today().isoformat()}.',
-        'world_version': env.world_version,
-    }
+        'task': args.task, 'objects': args.objects}
     pairs = None
     if config.pair_minutes and not args.init:
         pairs = _pair_sources(args, config)
     print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
-                pairs=pairs))
+                pairs=pairs, bags=bags))
+    return 0
+
+
+def _train_info(args, config, env, bags) -> dict:
+    """What every checkpoint of a training says."""
+    taught = '' if bags is None else (
+        f', beside {len(bags.drives):,} steps of {len(args.bags)} bag{"s" * (len(args.bags) > 1)}')
+    return {
+        'preset': args.preset,
+        'command': 'vn_nav ' + shlex.join(word for word in sys.argv[1:] if word != '--resume'),
+        'camera_fov_deg': math.degrees(env.robot.camera_fov),
+        'camera_height': env.robot.camera_height,
+        'notes': f'Trained on {machine(config.device)}, {config.threads} thread(s), '
+                 f'{datetime.date.today().isoformat()}{taught}.',
+        'world_version': env.world_version,
+    }
+
+
+def _bag_mix(args, config, robot):
+    """The bags that a training learns from as well; None: there are none."""
+    if not args.bags:
+        return None
+    from vn_nav.bags.drive import Topics, load_topics
+    from vn_nav.learning.bag_mix import BagMix
+    from vn_nav.learning.pretrain_command import load_bags
+    drives, _ = load_bags(args.bags, robot, args.size,
+                          load_topics(args.topics) if args.topics else Topics(),
+                          args.cache or args.out / 'decoded')
+    bags = BagMix(drives, config)
+    parts = ', '.join(bags.parts).replace('_', ' ')
+    for line in (*bags.words, f'bags teach {parts}'):
+        print(line, flush=True)
+    return bags
+
+
+def _train_over_ros(args) -> int:
+    """`vn_nav train --env ros`."""
+    import torch
+
+    from vn_nav.learning.trainer import train
+    from vn_nav.robot import RobotSpec, load_robot
+    try:
+        from vn_nav.nodes.ros_env import RosEnv
+    except ImportError as error:
+        raise UserError('training over ROS needs rclpy and the common messages', str(error),
+                        "source ROS 2, or pip install 'vn_nav[ros]'") from error
+    if torch.distributed.is_torchelastic_launched():
+        raise UserError('one process trains over ROS', 'torchrun',
+                        'name several robots with --namespaces instead')
+    config, world = train_config(args), world_options(args)
+    robot = (load_robot(args.robot) if args.robot else RobotSpec()).with_actions(
+        args.actions.split(','))
+    bags = _bag_mix(args, config, robot)  # no robot waits for the decoding
+    with RosEnv(robot, args.size,
+                namespaces=args.namespaces or ('',), lock_step=args.lock_step,
+                max_decisions=world['max_decisions'], collision_reward=world['collision_reward'],
+                record=args.record, ros_arguments=args.ros_args or ()) as env:
+        config, words = config_over_ros(config, world, env.offers, args.lock_step)
+        for line in words:
+            print(line, flush=True)
+        env.listen(config.privileged)
+        info = _train_info(args, config, env, bags) | {
+            'houses': [env.scene['house']] if 'house' in env.scene else [],
+            'rooms': env.scene.get('rooms')}
+
+        def say(row: dict) -> None:
+            print(f'{row["frames"]:,} frames: {env.steps / env.seconds:.2f} steps/s over ROS, '
+                  f'{row["fps"]:.2f} with learning', flush=True)
+        print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
+                    bags=bags, on_update=say))
     return 0
 
 
@@ -240,6 +315,12 @@ def _pair_sources(args, config):
         return (PairSampler(SPLITS['train'][:config.pair_houses], seed=args.seed, **options),
                 PairSampler(SPLITS['validation'][:16], seed=args.seed + 1, **options))
     return make
+
+
+def run_teach(args) -> int:
+    """`vn_nav teach`."""
+    from vn_sim_bridge import teach as place
+    return teach(args, place)
 
 
 def machine(device: str = 'cpu') -> str:

@@ -12,6 +12,13 @@ import math
 import numba
 import numpy as np
 
+# What poses alone say, see `overlap_by_poses`.
+NEAR = 1.0  # m driven between them
+AHEAD = 5.0  # m that a goal straight ahead may be away
+STRAIGHT = 1.1  # metres driven for each metre of the straight line
+FAR = 6.0  # m of straight line
+FAR_TURN = math.radians(60.0)
+PAST_VIEW = math.radians(15.0)  # that a camera turns beyond its field of view
 GRID = 8  # points across a goal picture, and down
 FARTHEST = 12.0  # m: a point beyond is left out
 TOLERANCE = 0.1  # share of its depth by which a point may disagree with the robot's picture,
@@ -74,6 +81,37 @@ def overlap(points: np.ndarray, depth: np.ndarray, cameras: np.ndarray,
     focal = size / 2 / np.tan(np.asarray(fov, float) / 2)
     return _overlap(points, depth, np.ascontiguousarray(cameras[:, :3]), _axes(cameras),
                     np.ascontiguousarray(focal))
+
+
+def overlap_by_poses(goal_pose: np.ndarray, driven: np.ndarray, fov: float) -> np.ndarray:
+    """Whether pictures show the same, as far as poses alone say so.
+
+    1: no more than `NEAR` was driven between them and the headings differ by less than half a
+    field of view; or the goal is ahead, within a third of the field of view as is its heading,
+    and the robot drove there straight, so that nothing stands in between. 0: the robot stayed
+    `NEAR` but turned by more than its field of view and `PAST_VIEW`; or they are `FAR` apart and
+    turned by `FAR_TURN`. Else -1: walls decide, of which poses know nothing. Along shortest paths
+    in validation houses 99.0 % of the ones share at least a tenth of the goal picture, and 95.7 %
+    of the zeros do not (docs/method.md). Metres along the drive, because a straight line may pass
+    through a wall; but a straight line for what is far, because a drive may come back.
+
+    Args:
+        goal_pose: [K,4] as of `relative_pose`.
+        driven: [K] m between the two pictures.
+        fov: of the camera [rad].
+
+    Returns:
+        [K] float32.
+    """
+    gap = np.hypot(goal_pose[:, 0], goal_pose[:, 1])
+    bearing = np.abs(np.arctan2(goal_pose[:, 1], goal_pose[:, 0]))
+    turn = np.abs(np.arctan2(goal_pose[:, 3], goal_pose[:, 2]))
+    near = driven <= NEAR
+    ahead = (gap <= AHEAD) & (driven <= STRAIGHT * gap) & (np.maximum(bearing, turn) <= fov / 3)
+    shown = np.full(len(goal_pose), -1.0, np.float32)
+    shown[(near & (turn <= fov / 2)) | ahead] = 1.0
+    shown[(near & (turn >= fov + PAST_VIEW)) | ((gap >= FAR) & (turn >= FAR_TURN))] = 0.0
+    return shown
 
 
 def _axes(cameras: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""`NavigationEnv`: many robots in embedded houses with a task, as a Gymnasium VectorEnv."""
+"""`NavigationEnv`: many robots with a task, in houses or other places, as a VectorEnv."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import gymnasium
@@ -15,13 +16,14 @@ from vn_nav.errors import UserError
 from vn_nav.overlap import GRID, lift, overlap, relative_pose
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge import tasks
-from vn_sim_bridge.backends.base import Frames
+from vn_sim_bridge.backends.base import Frames, Simulator
 from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.explorer import Explorer
 from vn_sim_bridge.houses.house import CELL, interpolate
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS
 from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.oracle import FloorOracle, turning_table
 from vn_sim_bridge.randomisation import Randomisation
 from vn_sim_bridge.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.world import motion_noise
@@ -30,8 +32,6 @@ TASKS = ('image', 'object', 'room', 'collect')
 PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
               'overlap', 'explorer_action')
 STOPS = ('arrival', 'declared')
-TURN_COST = 0.05  # m, what the shortest-path action charges for one rotation
-BLOCKED_COST = 1.0  # per metre that a contact cuts off a forward move
 SQUARE = 1.0  # m, side of the squares of floor that exploration counts
 BATCH = 256  # goal pictures drawn at a time: few need little memory
 
@@ -97,7 +97,7 @@ class EnvConfig:
 
 
 class NavigationEnv(gymnasium.vector.VectorEnv):
-    """Visual navigation in embedded houses.
+    """Visual navigation in embedded houses, or where another simulator puts the robots.
 
     Observations are a dict of arrays over the N environments: `image` [N,3,H,W] uint8,
     `goal_index` [N] int64 into `goals`, `last_action` [N] int64 (-1 at an episode's start) and
@@ -123,23 +123,29 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         config: what to simulate.
         robot: actions, camera and footprint; the standard robot if left out.
         threads: threads that draw.
+        backend: robots and places instead of the configuration's houses: as many robots, and
+            pictures as large, as the configuration says.
     """
 
     metadata = {'autoreset_mode': AutoresetMode.NEXT_STEP, 'render_modes': []}
 
     def __init__(self, config: EnvConfig | None = None, robot: RobotSpec | None = None, *,
-                 threads: int = 1):
+                 threads: int = 1, backend: Simulator | None = None):
         self.config = config = config or EnvConfig()
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs = n = config.num_envs
-        self.houses = [generate_house(seed, rooms=config.rooms,
-                                      goals_per_room=config.goals_per_room,
-                                      goal_seed=config.goal_seed)
-                       for seed in config.houses]
+        if backend is None:
+            self.houses = [generate_house(seed, rooms=config.rooms,
+                                          goals_per_room=config.goals_per_room,
+                                          goal_seed=config.goal_seed)
+                           for seed in config.houses]
+        else:
+            self._check_backend(backend)
+            self.houses = list(backend.houses)
         self._wanders = len(self.houses) > n and not config.one_goal_per_env
         self._seed = config.seed
         self.task = self._make_task()
-        self.backend = HouseBackend(
+        self.backend: Simulator = backend or HouseBackend(
             self.houses, np.arange(n) % len(self.houses), robot=self.robot, size=config.size,
             threads=threads, randomisation=config.randomisation, models=self.task.models,
             objects=self.task.objects)
@@ -178,30 +184,43 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                 '_picture': set(config.privileged) & {'goal_pose', 'overlap', 'explorer_action'}}
         self._state = (*self._STATE, *(name for name in used if used[name]))
         self._explorer = self._make_explorer() if 'explorer_action' in config.privileged else None
+        self._oracle: FloorOracle | None = None  # made when it is asked for
+
+    def _check_backend(self, backend: Simulator) -> None:
+        """Whether a simulator can do what the configuration asks for."""
+        config, can, told = self.config, backend.capabilities, set(self.config.privileged)
+        tilts = any(action.dpitch for action in self.robot.actions)
+        rules = (
+            (backend.num_envs == config.num_envs, 'a backend has as many robots as the '
+             f'configuration: {config.num_envs}', backend.num_envs),
+            (can.scene or config.task == 'image', 'the backend knows a floor and no rooms or '
+             'objects: its task is image', config.task),
+            (can.scene or 'explorer_action' not in told, 'the backend knows no walls, which the '
+             'explorer needs', 'explorer_action'),
+            (can.depth or 'depth' not in told, 'the backend has depth pictures', 'none'),
+            (can.labels or not told & {'segmentation', 'goal_segmentation'},
+             'the backend has labels', 'none'),
+            (can.tilt or not tilts, 'the camera of the backend is fixed',
+             self.robot.action_names),
+        )
+        for kept, rule, received in rules:
+            if not kept:
+                raise UserError(rule, received, 'correct the environment configuration')
 
     @property
     def house_index(self) -> np.ndarray:
         """[N] the house of each robot."""
-        return self.backend.world.house_index
+        return self.backend.house_index
 
     def _make_explorer(self) -> Explorer:
         if self.config.task != 'image':
             raise UserError('the explorer looks for the place of a picture (task image)',
                             self.config.task, 'leave out explorer_action')
-        table = self._turning_table()
+        table = turning_table(self.action_names)
         return Explorer(
             self.houses, self.num_envs, fov=self.robot.camera_fov,
             turn=self._deltas[table['rotate_left'], 2], length=self._deltas[table['forward'], 0],
             radius=tasks.ARRIVAL_RADIUS)
-
-    def _turning_table(self) -> dict[str, int]:
-        """Numbers of the actions by name, of a robot that can turn and drive forward."""
-        table = {name: index for index, name in enumerate(self.action_names)}
-        for name in ('forward', 'rotate_left', 'rotate_right'):
-            if name not in table:
-                raise UserError('path-following actions need forward and both rotations',
-                                self.action_names, 'add them to the actions')
-        return table
 
     def _make_task(self) -> tasks.Task:
         config, common = self.config, (self.houses, self.config.num_envs)
@@ -228,7 +247,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.goals = np.full((count + 1, 3, size, size), 128, np.uint8)
         self.goal_segmentation = np.zeros((count + 1, size, size), np.uint8)
         self.blank_goal = count
-        wanted = bool({'overlap', 'explorer_action'} & set(self.config.privileged))
+        wanted = self.backend.capabilities.depth and bool(
+            {'overlap', 'explorer_action'} & set(self.config.privileged))
         self._goal_points = np.full((count + 1 if wanted else 0, GRID * GRID, 3), np.nan,
                                     np.float32)
         for first in range(0, count, BATCH):
@@ -501,18 +521,23 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         turned = np.where(self._last_action < 0, 0, np.sign(self._deltas[self._last_action, 2]))
         turns = self._explorer.turns(self.backend.poses, self.house_index, overlap,
                                      self._distance, self._goal_yaw, self._maps, turned)
-        table = self._turning_table()
+        table = turning_table(self.action_names)
         return np.where(turns == 0, table['forward'], np.where(
             turns > 0, table['rotate_left'], table['rotate_right']))
 
     def _goal_pose(self) -> np.ndarray:
         if not self.task.views:
             return np.zeros((self.num_envs, 4), np.float32)
-        return relative_pose(self.backend.poses, self.goal_poses[self._picture // self._variants])
+        # As the picture shows it, which was taken a little beside the robot in some backends.
+        return relative_pose(self.backend.seen_from,
+                             self.goal_poses[self._picture // self._variants])
 
     def _overlap(self, depth: np.ndarray) -> np.ndarray:
         if not self.task.views:
             return np.zeros(self.num_envs, np.float32)
+        if not self.backend.capabilities.depth:
+            shown = self.backend.overlap(self.goal_poses[self._picture // self._variants])
+            return np.where(self._shown_goal == self.blank_goal, np.float32(0), shown)
         # The grey picture has no points.
         picture = np.where(self._shown_goal == self.blank_goal, self.blank_goal, self._picture)
         return overlap(self._goal_points[picture], depth, *self.backend.cameras())
@@ -520,38 +545,29 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def oracle_actions(self) -> np.ndarray:
         """The next action [N] on a shortest path to the goal, from the simulator's geometry.
 
-        Far from the goal: the heading, among those that rotations reach, whose forward move comes
-        closest to the goal, charging `TURN_COST` a rotation and `BLOCKED_COST` for contacts.
-        At the goal: turn to its yaw; having arrived, declare it where that ends an episode.
+        See `oracle.FloorOracle`; a backend with routes of its own answers itself. Having arrived,
+        declare it where that ends an episode.
         """
         if self.config.task == 'collect':
             raise UserError('the shortest-path action needs a task with a goal', 'collect',
                             'use another control')
-        table = self._turning_table()
-        turn = self._deltas[table['rotate_left'], 2]
-        length = self._deltas[table['forward'], 0]
-        half = math.ceil(math.pi / turn)
-        turns = np.arange(-half + 1, half + 1)
-        actions = np.empty(self.num_envs, np.int64)
         there = tasks.arrived(self._distance, self._heading_error())
-        for n in range(self.num_envs):
-            if self.declare_action is not None and there[n]:
-                actions[n] = self.declare_action
-                continue
-            yaw = self.backend.poses[n, 2]
-            if self.config.task == 'image' and self._distance[n] <= tasks.ARRIVAL_RADIUS:
-                wanted = tasks.wrap_angle(self._goal_yaw[n] - yaw)
-            else:
-                ends = self.backend.world.reach(n, yaw + turns * turn, length)
-                cut = length - np.hypot(*(ends - self.backend.poses[n, :2]).T)
-                cost = (self._distance_of(np.full(len(ends), n), ends)
-                        + TURN_COST * np.abs(turns) + BLOCKED_COST * cut)
-                wanted = turns[np.argmin(cost)] * turn
-            if abs(wanted) < turn / 2:
-                actions[n] = table['forward']
-            else:
-                actions[n] = table['rotate_left' if wanted > 0 else 'rotate_right']
-        return actions
+        if self.backend.routes is not None:
+            actions = self.backend.routes.actions(self.backend.poses, self.goal_poses[self._goal])
+        else:
+            actions = self._floor_actions()
+        return actions if self.declare_action is None else np.where(
+            there, self.declare_action, actions)
+
+    def _floor_actions(self) -> np.ndarray:
+        if self._oracle is None:
+            self._oracle = FloorOracle(self.action_names, self._deltas)
+        near = (self._distance <= tasks.ARRIVAL_RADIUS) & (self.config.task == 'image')
+        return np.array([self._oracle.action(
+            self.backend.poses[n], self._goal_yaw[n] if near[n] else None,
+            functools.partial(self.backend.reach, n),
+            lambda ends, n=n: self._distance_of(np.full(len(ends), n), ends))
+            for n in range(self.num_envs)], np.int64)
 
 
 class HouseNavigation(gymnasium.Env):

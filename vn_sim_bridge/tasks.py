@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -24,6 +25,7 @@ from vn_nav.arrival import (  # noqa: F401
     heading_error,
     wrap_angle,
 )
+from vn_sim_bridge.backends.base import Place
 from vn_sim_bridge.counter_random import Stream, uniform
 from vn_sim_bridge.houses.house import DistanceField, Goal, House
 from vn_sim_bridge.houses.labels import LABEL
@@ -88,16 +90,16 @@ def draw_wrong_goal(count: int, right: int, seed: int, env, episode) -> int:
 
 
 class Starts:
-    """Where episodes towards a goal may start: the free cells, by distance.
+    """Where episodes towards a goal may start (in a house: the free cells), by distance.
 
     Args:
-        house: the house.
+        house: the house, or another place.
         field: distances to the goal.
         min_distance: that a start keeps from the goal [m], as long as any cell does.
     """
 
-    def __init__(self, house: House, field: DistanceField, min_distance: float):
-        cells = house.floor.centres()
+    def __init__(self, house: Place, field: DistanceField, min_distance: float):
+        cells, headings = house.starts()
         distance = field.distance(cells)
         keep = np.isfinite(distance) & (distance >= min_distance)
         if not keep.any():
@@ -105,6 +107,7 @@ class Starts:
         order = np.argsort(distance[keep], kind='stable')
         self.cells = cells[keep][order]  # [K,2], nearest first
         self.distances = distance[keep][order]
+        self.headings = None if headings is None else headings[keep][order]  # None: any
 
     def draw(self, tau: float, seed: int, env, episode) -> np.ndarray:
         """A start pose for an episode: uniform over the cells within tau of the maximum distance.
@@ -119,14 +122,15 @@ class Starts:
         limit = tau * self.distances[-1]
         count = max(int(np.searchsorted(self.distances, limit, side='right')), 1)
         cell = draw_index(count, seed, Stream.START_CELL, env, episode)
-        yaw = (uniform(seed, Stream.START_YAW, env, episode) * 2 - 1) * math.pi
+        yaw = ((uniform(seed, Stream.START_YAW, env, episode) * 2 - 1) * math.pi
+               if self.headings is None else self.headings[cell])
         return np.array([*self.cells[cell], float(yaw), 0.0])
 
 
 class GoalField:
     """One goal pose of one house: distances to it, and where episodes towards it may start."""
 
-    def __init__(self, house: House, goal: Goal, min_distance: float):
+    def __init__(self, house: Place, goal: Goal, min_distance: float):
         self.goal = goal
         self.field: DistanceField = house.geodesic(goal.pose[0], goal.pose[1])
         self.starts = Starts(house, self.field, min_distance)
@@ -227,7 +231,7 @@ class _Pool:
 class ImageGoal(_Pool):
     """To the pose from which a picture was taken (thesis, chapter 4)."""
 
-    def __init__(self, houses: list[House], num_envs: int, *, min_distance: float,
+    def __init__(self, houses: Sequence[Place], num_envs: int, *, min_distance: float,
                  fixed_goals: bool = False):
         super().__init__()
         self.fixed_goals, self.houses = fixed_goals, len(houses)

@@ -108,11 +108,15 @@ def reward_prediction_loss(network: Policy, maps: Tensor, label: Tensor) -> Tens
 
 
 def goal_pose_loss(latents: Latents, rollout: Rollout) -> Tensor:
-    """Relative pose of the goal where the pictures overlap, and whether they do."""
+    """Relative pose of the goal where the pictures overlap, and whether they do.
+
+    A negative overlap is unknown: such rows teach nothing.
+    """
     rows = rollout.valid.numel()
+    overlap = _privileged(rollout, 'overlap')[:-1].flatten()
     return pose_loss(*(part[:rows] for part in latents.pose),
-                     _privileged(rollout, 'goal_pose')[:-1].flatten(0, 1),
-                     _privileged(rollout, 'overlap')[:-1].flatten(), rollout.valid.flatten())
+                     _privileged(rollout, 'goal_pose')[:-1].flatten(0, 1), overlap,
+                     rollout.valid.flatten() & (overlap >= 0))
 
 
 def pose_loss(position: Tensor, heading: Tensor, overlap_logit: Tensor, goal_pose: Tensor,

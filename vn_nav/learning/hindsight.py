@@ -7,7 +7,6 @@ show the same. Rows are steps of all drives in one count; K pairs, T steps, W wi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,19 +16,12 @@ from vn_nav.arrival import arrived, heading_error
 from vn_nav.bags.drive import MISFIT
 from vn_nav.errors import UserError
 from vn_nav.learning.auxiliary import MAX_DEPTH
-from vn_nav.overlap import lift, overlap, relative_pose
+from vn_nav.overlap import lift, overlap, overlap_by_poses, relative_pose
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:
     from vn_nav.bags.dataset import DriveSet
 
-# What odometry alone says of two pictures, see `Drives.overlap_by_odometry`.
-NEAR = 1.0  # m driven between them
-AHEAD = 5.0  # m that a goal straight ahead may be away
-STRAIGHT = 1.1  # metres driven for each metre of the straight line
-FAR = 6.0  # m of straight line
-FAR_TURN = math.radians(60.0)
-PAST_VIEW = math.radians(15.0)  # that a camera turns beyond its field of view
 # Half of the partners lie within so many steps: the others show the same place too seldom.
 NEIGHBOURS = 8
 LEAST = 2  # steps of a part of a drive to learn from, or to judge by
@@ -135,30 +127,9 @@ class Drives:
         return shown
 
     def overlap_by_odometry(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Whether pictures show the same, as far as poses alone say so, [K] float32.
-
-        1: no more than `NEAR` was driven between them and the headings differ by less than half a
-        field of view; or the goal is ahead, within a third of the field of view as is its
-        heading, and the robot drove there straight, so that nothing stands in between. 0: the
-        robot stayed `NEAR` but turned by more than its field of view and `PAST_VIEW`; or they are
-        `FAR` apart and turned by `FAR_TURN`. Else -1: walls decide, of which odometry knows
-        nothing. Along shortest paths in validation houses 99.0 % of the ones share at least a
-        tenth of the goal picture, and 95.7 % of the zeros do not (docs/method.md). Metres along
-        the drive, because a straight line may pass through a wall; but a straight line for what
-        is far, because a drive may come back.
-        """
+        """What the poses and the metres driven say, see `overlap.overlap_by_poses`."""
         pose = relative_pose(self.pose[rows], self.pose[goals])
-        gap = np.hypot(pose[:, 0], pose[:, 1])
-        bearing = np.abs(np.arctan2(pose[:, 1], pose[:, 0]))
-        turn = heading_error(self.pose[rows, 2], self.pose[goals, 2])
-        driven, view = self._driven(rows, goals), self.robot.camera_fov
-        near = driven <= NEAR
-        ahead = ((gap <= AHEAD) & (driven <= STRAIGHT * gap)
-                 & (np.maximum(bearing, turn) <= view / 3))
-        shown = np.full(len(pose), -1.0, np.float32)
-        shown[(near & (turn <= view / 2)) | ahead] = 1.0
-        shown[(near & (turn >= view + PAST_VIEW)) | ((gap >= FAR) & (turn >= FAR_TURN))] = 0.0
-        return shown
+        return overlap_by_poses(pose, self._driven(rows, goals), self.robot.camera_fov)
 
     def _driven(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
         return np.abs(self._along[goals] - self._along[rows])

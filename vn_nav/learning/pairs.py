@@ -136,9 +136,10 @@ def measure(network: Policy, pairs: dict[str, np.ndarray]) -> dict[str, float]:
 
 
 def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
-    """Median errors over the pairs that overlap, and accuracy of the overlap over all."""
+    """Median errors over the pairs that overlap; of the overlap accuracy, where it is known."""
     truth = torch.from_numpy(pairs['goal_pose'])
-    sees = torch.from_numpy(pairs['overlap']) >= POSE_OVERLAP
+    overlap = torch.from_numpy(pairs['overlap'])
+    sees, known = overlap >= POSE_OVERLAP, overlap >= 0
     position, heading = pose.position.detach()[sees], pose.heading.detach()[sees]
     true_position, true_heading = truth[sees, :2], truth[sees, 2:]
     far = true_position.norm(dim=1) > 0.3  # nearer, a bearing means nothing
@@ -148,7 +149,7 @@ def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
         'bearing_deg': _median(bearing), 'bearing_within_30': _mean(bearing <= 30),
         'heading_deg': _median(_angle(heading, true_heading)),
         'distance_m': _median((position - true_position).norm(dim=1)),
-        'overlap_accuracy': _mean(correct),
+        'overlap_accuracy': _mean(correct[known]),
     }
 
 

@@ -33,8 +33,10 @@ class HouseBackend:
         models: names of the objects that may stand in the houses; objects: most at a time.
     """
 
-    capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True)
+    capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True,
+                                scene=True)
     world_version = WORLD_VERSION
+    routes = None  # nothing keeps a robot from turning
 
     def __init__(self, houses: Sequence[House], house_index: Sequence[int], *, robot: RobotSpec,
                  size: int = 84, threads: int = 1, randomisation: Randomisation | None = None,
@@ -62,6 +64,16 @@ class HouseBackend:
         """[N,4] x, y, yaw, pitch; a view that changes with the next move."""
         return self.world.poses
 
+    @property
+    def house_index(self) -> np.ndarray:
+        """[N] the house of each robot."""
+        return self.world.house_index
+
+    @property
+    def seen_from(self) -> np.ndarray:
+        """[N,4]: pictures are drawn from where the robots are."""
+        return self.world.poses
+
     def enter(self, env_ids: np.ndarray, houses: np.ndarray) -> None:
         """Put robots [K] into houses [K]; their poses are still to be set."""
         self.world.house_index[env_ids] = houses
@@ -73,6 +85,10 @@ class HouseBackend:
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
         """Displace robots by [K,4] in their own frames, up to the first contact."""
         return Motion(*self.world.move(delta, self._all if env_ids is None else env_ids))
+
+    def reach(self, env_id: int, headings: np.ndarray, length: float) -> np.ndarray:
+        """Where a translation of `length` [m] along each heading [rad] would end, [K,2] m."""
+        return self.world.reach(env_id, headings, length)
 
     def appearance(self, seed: int, stream: Stream, env, episode) -> Appearance:
         """Light and camera of some episodes, or of some goal pictures."""

@@ -74,6 +74,10 @@ class House:
         """Shortest driving distance from anywhere to (x, y)."""
         return DistanceField(self.floor, x, y)
 
+    def starts(self) -> tuple[np.ndarray, None]:
+        """Where episodes may begin, see `backends.base.Place`: anywhere, facing anywhere."""
+        return self.floor.centres(), None
+
     def room_at(self, x: float, y: float) -> str:
         """Name of the room that holds a point; '' inside walls and doors."""
         for room in self.rooms:

@@ -1,0 +1,196 @@
+"""`vn_nav teach`: from a bag to a policy for the place where it was driven."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from small_bags import (
+    IMAGE,
+    INFO,
+    ODOMETRY,
+    START,
+    STRING,
+    camera_info,
+    make,
+    odometry,
+    picture,
+    serialised,
+)
+
+from vn_msgs_py.topics import topic
+from vn_nav.bags.recorder import BagWriter
+from vn_nav.cli import main
+from vn_nav.errors import UserError
+from vn_nav.learning.presets import preset
+from vn_nav.learning.trainer import train
+from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_sim_bridge.backends.house import HouseBackend
+from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.image_graph import build_graph
+from vn_sim_bridge.joystick import Joystick
+from vn_sim_bridge.simulated_robot import TICK
+from vn_sim_bridge.teach import draw_map, held_out, make_env, make_pairs
+from vn_sim_bridge.world import WORLD_VERSION
+
+ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
+SIZE = 36
+EVERY = 4  # ticks between two pictures
+
+
+def drive(seconds, rooms=1, house=7, size=SIZE):
+    """Poses [N,3] and pictures of somebody with a joystick in a small house."""
+    built = generate_house(house, rooms=rooms)
+    backend = HouseBackend([built], [0], robot=ROBOT, size=size)
+    cells = built.floor.centres()
+    start = cells[np.argmin(np.hypot(*(cells - built.goals[0].pose[:2]).T))]
+    backend.place(np.array([0]), np.array([[*start, 0.0, 0.0]]))
+    person, poses, pictures = Joystick(built, *start), [], []
+    for tick in range(int(seconds / TICK)):
+        backend.move(person.velocity(backend.poses[0])[None] * TICK)
+        if tick % EVERY == 0:
+            poses.append(backend.poses[0, :3].copy())
+            pictures.append(backend.observe().rgb[0].copy())
+    return np.array(poses), np.array(pictures)
+
+
+def write_bag(folder, poses, pictures):
+    """The drive as a recorder leaves it: pictures, odometry, calibration, and a world version."""
+    size = pictures.shape[-1]
+    with BagWriter(folder, [topic(n) for n in ('image_raw', 'odom', 'camera_info', 'scene')]) as (
+            writer):
+        def write(name, kind, time, message):
+            writer.write(name, serialised(kind, message), time)
+        write('scene', STRING, START, make(STRING, data=json.dumps(
+            {'world_version': WORLD_VERSION})))
+        for k, (x, y, yaw) in enumerate(poses):
+            time = START + round(k * EVERY * TICK * 1e9)
+            told = odometry(time, x, yaw)
+            told.pose.pose.position.y = float(y)
+            write('odom', ODOMETRY, time, told)
+            write('camera_info', INFO, time, camera_info(time, size / 2, size))
+            write('image_raw', IMAGE, time, picture(time, np.ascontiguousarray(
+                pictures[k].transpose(1, 2, 0))))
+    return folder
+
+
+@pytest.fixture(scope='module')
+def driven():
+    torch.set_num_threads(1)
+    return drive(100)
+
+
+@pytest.fixture(scope='module')
+def graph(driven):
+    poses, pictures = driven
+    return build_graph(pictures, poses, np.zeros(len(poses), int), ROBOT, goals=24,
+                       world_version=WORLD_VERSION)
+
+
+def test_a_drive_with_a_joystick_is_a_place(graph):
+    """Nothing of it is cut off, robots can turn everywhere, and ways lead to all goals."""
+    assert len(graph.goals) >= 12 and graph.geodesic(*graph.goals[0].pose[:2]).maximum > 2
+    assert graph.map.component.mean() > 0.99 and graph.world_version == WORLD_VERSION
+    env = make_env(graph, ROBOT, 16, max_decisions=60)
+    _, info = env.reset(seed=0)
+    ends = []
+    for _ in range(80):
+        _, _, terminated, truncated, info = env.step(env.oracle_actions())
+        ends += info['success'][terminated | truncated].tolist()
+    assert len(ends) > 30 and np.mean(ends) > 0.95
+
+
+def test_the_map_shows_pictures_and_goals(graph, tmp_path):
+    draw_map(tmp_path / 'map.png', *held_out(graph))
+    shown = cv2.imread(str(tmp_path / 'map.png'))[..., ::-1].reshape(-1, 3).tolist()
+    colours = {tuple(pixel) for pixel in shown}
+    assert {(42, 98, 201), (196, 87, 44), (120, 128, 140)} <= colours
+
+
+def test_picture_pairs_come_first_and_after_the_weights_of_a_checkpoint(graph, tmp_path):
+    own, others = held_out(graph)
+    config = preset('fast', channels=(8, 8, 8), features=16, hidden=16, frames=64,
+                    rollout_length=16, pair_minutes=0.01, bf16=False, learning_rate=1e-9,
+                    final_learning_rate=1e-9)
+    info = {'world_version': WORLD_VERSION, 'camera_fov_deg': 90.0, 'camera_height': 1.0}
+
+    def trained(name, **options):
+        env = make_env(own, ROBOT, 4, privileged=config.privileged, max_decisions=20)
+        return load_checkpoint(train(env, config, tmp_path / name, info=info, **options)
+                               ).network.state_dict()
+    plain = trained('plain')
+    begun = trained('begun', init=tmp_path / 'plain' / 'checkpoint',
+                    pairs=lambda: make_pairs(own, others, ROBOT, 0))
+    assert (tmp_path / 'begun' / 'pairs' / 'pairs.csv').is_file()
+    assert not (tmp_path / 'plain' / 'pairs').exists()
+    same = {name for name in plain if torch.allclose(plain[name], begun[name], atol=1e-6)}
+    assert any(name.startswith('encoder') for name in plain.keys() - same)
+    assert {name for name in plain if name.startswith('actor')} <= same
+
+
+@pytest.mark.parametrize(('words', 'says'), [
+    (['--minutes', '0'], 'some time to learn'),
+    (['--goals', '1'], 'at least four goals'),
+    (['--checkpoint', 'models/house', '--size', '32'], 'size is that of the checkpoint'),
+    (['--checkpoint', 'nowhere'], 'a checkpoint is a folder'),
+    (['--robot', 'nowhere.yaml'], 'a robot file exists'),
+    (['--topics', 'nowhere.yaml'], 'in a YAML file'),
+    (['--set', 'teacher=nobody'], 'the teacher is one of'),
+])
+def test_bad_options_are_one_line_and_code_2(words, says, tmp_path, capsys):
+    code = main(['teach', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), *words])
+    said = capsys.readouterr().err
+    assert code == 2 and says in said and said.count('\n') == 1
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_drive_that_leads_nowhere_is_one_line_and_code_2(driven, tmp_path, capsys):
+    poses, pictures = (part[:40] for part in driven)  # only turns, on the first spot
+    bag = write_bag(tmp_path / 'bag', poses, pictures)
+    code = main(['teach', str(bag), '--out', str(tmp_path / 'out'), '--size', '36'])
+    said = capsys.readouterr().err
+    assert code == 2 and 'leads through a place' in said and said.count('\n') == 1
+    assert not (tmp_path / 'out' / 'checkpoint').exists()
+
+
+def test_the_robot_needs_the_actions_of_the_checkpoint(driven, tmp_path, capsys):
+    bag = write_bag(tmp_path / 'bag', *(part[:5] for part in driven))
+    (tmp_path / 'robot.yaml').write_text(
+        'name: short\nactions:\n- {name: forward, dx: 0.3}\n- {name: backward, dx: -0.2}\n'
+        '- {name: rotate_left, dyaw_deg: 30}\n- {name: rotate_right, dyaw_deg: -30}\n')
+    assert main(['teach', str(bag), '--out', str(tmp_path / 'out'), '--checkpoint',
+                 'models/anywhere', '--robot', str(tmp_path / 'robot.yaml')]) == 2
+    assert 'how far forward moves the robot' in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_a_minute_in_the_pictures_of_a_drive_beats_chance(tmp_path):
+    bag = write_bag(tmp_path / 'bag', *drive(160, rooms=2))
+    out = tmp_path / 'out'
+    assert main(['teach', str(bag), '--out', str(out), '--size', str(SIZE), '--minutes', '1.5',
+                 '--goals', '12', '--envs', '32', '--set', 'hidden=128', '--set', 'features=128',
+                 '--episodes', '32']) == 0
+    result = json.loads((out / 'evaluation.json').read_text())
+    rows = result['splits']['seen_goals']['rows']['arrival']
+    success = {name: row['success'] for name, row in rows.items()}
+    assert success['right goal, sample'] > success['random actions'] + 0.2
+    assert success['shortest path'] > 0.95
+    loaded = load_checkpoint(out / 'checkpoint')
+    assert loaded.config.size == SIZE and loaded.info['world_version'] == WORLD_VERSION
+    assert loaded.info['stop_threshold'] == 0.5 and 'Taught in the pictures' in (
+        loaded.info['notes'])
+    assert any('unseen_goals' in name for name in loaded.info['results'])
+    assert '<svg' in (out / 'evaluation.html').read_text() and (out / 'map.png').is_file()
+    assert math.isclose(loaded.info['camera_fov_deg'], 90)
+    with pytest.raises(UserError, match='a folder of its own'):
+        raise_of(bag, out)
+
+
+def raise_of(bag, out):
+    """Teach again where something was taught already."""
+    from vn_nav.cli import build_parser, run_teach
+    run_teach(build_parser().parse_args(['teach', str(bag), '--out', str(out)]))

@@ -1,0 +1,278 @@
+"""`vn_nav teach`: a policy for the place where a bag was driven, learned in the bag's pictures.
+
+The simulator's half, which makes a place out of pictures with poses, comes from the caller
+(`vn_sim_bridge.teach`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import math
+import shlex
+import sys
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
+from vn_nav.bags.drive import Topics, load_topics
+from vn_nav.bags.loops import straighten
+from vn_nav.errors import UserError
+from vn_nav.evaluation import evaluator, tables
+from vn_nav.evaluation.evaluation_page import evaluation_page
+from vn_nav.learning.command import CHANGES, train_config
+from vn_nav.learning.pairs import PairSource
+from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
+from vn_nav.learning.pretrain_command import RECORDED, scene_of
+from vn_nav.learning.trainer import STATE, train
+from vn_nav.policy.checkpoint import (
+    LoadedCheckpoint,
+    load_checkpoint,
+    save_checkpoint,
+    write_file,
+)
+from vn_nav.policy.network import Policy
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
+
+PRESET = 'fast'
+# The place is one to know by heart: there the shortest path is something to imitate.
+TEACHER = {'imitation': 1.0, 'imitation_until': 1.0, 'teacher': 'oracle', 'teacher_share': 0.5,
+           'teacher_until': 0.6, 'start_difficulty': 1.0}
+# Without a checkpoint: much is learned from each rollout, and first from picture pairs, for so
+# large a share of the minutes.
+FROM_NOTHING = {'epochs': 4, 'minibatches': 8, 'learning_rate': 1e-3}
+PAIR_SHARE = 0.1
+COLLISION_REWARD = -0.05  # of leaving what the pictures cover
+LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by
+CONTROLS = (evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST)
+BEFORE = 'before teaching'
+SPLITS = ('seen_goals', 'unseen_goals')
+EVALUATION_SEED = 10_000
+
+
+class Place(Protocol):
+    """What the simulator's half makes of a drive; `vn_sim_bridge.teach` is one."""
+
+    MARGIN: float  # m beside the driven path that count as free
+
+    def build_graph(self, pictures, poses, episode, robot: RobotSpec, **options) -> Any:
+        """A place out of pictures with poses."""
+
+    def held_out(self, graph) -> tuple[Any, Any]:
+        """The place with the goals to learn, and with those to judge by, or None."""
+
+    def make_env(self, graph, robot: RobotSpec, envs: int, **options) -> Any:
+        """A vector environment there."""
+
+    def make_pairs(self, own, others, robot: RobotSpec, seed: int
+                   ) -> tuple[PairSource, PairSource]:
+        """Picture pairs to learn from, and to judge by."""
+
+    def draw_map(self, path: Path, own, others) -> None:
+        """A picture of the place."""
+
+
+def add_teach_options(parser: argparse.ArgumentParser) -> None:
+    """Options of `vn_nav teach`."""
+    parser.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder or MCAP file')
+    parser.add_argument('--out', type=Path, required=True, help='folder of the run')
+    parser.add_argument('--checkpoint', type=Path, metavar='DIR', help='begin with this policy, '
+                        'for example models/anywhere: network, size and actions are its own; '
+                        'default: from nothing')
+    parser.add_argument('--minutes', type=float, default=30.0, help='of learning')
+    parser.add_argument('--robot', type=Path, metavar='YAML',
+                        help='that drove, with its camera; default: the standard robot')
+    parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
+    parser.add_argument('--margin', type=float, metavar='M',
+                        help='beside the driven path that counts as free [m]; default 0.3')
+    parser.add_argument('--straighten', action='store_true', help='correct odometry by the places '
+                        'that the drive shows twice, for odometry that drifts by more than that '
+                        'does (docs/bags.md)')
+    parser.add_argument('--goals', type=int, default=96, help='pictures to drive to, at most')
+    parser.add_argument('--episodes', type=int, default=50, help='of each row of the evaluation')
+    parser.add_argument('--size', type=int, help='without a checkpoint: side of the pictures '
+                        '[pixels]; default 84')
+    parser.add_argument('--envs', type=int, default=ENVIRONMENT[PRESET]['envs'],
+                        help='robots that learn at a time')
+    parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
+                        help='any number of vn_nav.learning.presets.TrainConfig')
+    parser.add_argument('--resume', action='store_true', help='go on with the run in --out')
+    parser.add_argument('--cache', type=Path, metavar='DIR',
+                        help='of decoded bags; default: OUT/decoded')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--threads', type=int, default=1, help='of torch')
+
+
+def teach(args: argparse.Namespace, place: Place) -> int:
+    """`vn_nav teach`.
+
+    Raises:
+        UserError: options, a bag or a checkpoint that do not fit; a drive too short, or of one
+            spot.
+    """
+    _check(args)
+    given = load_checkpoint(args.checkpoint) if args.checkpoint else None
+    config = _config(args, given)
+    robot = _robot(args, given)
+    size = given.config.size if given else args.size or 84
+    graph = _graph(args, place, robot, size)
+    own, others = place.held_out(graph)
+    for line in (*graph.words, 'no goals are held out: there are too few' if others is None else
+                 f'{len(own.goals)} goals to learn, {len(others.goals)} held out'):
+        print(line, flush=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    place.draw_map(args.out / 'map.png', own, others)
+    world = ENVIRONMENT[PRESET] | {'collision_reward': COLLISION_REWARD}
+    env = place.make_env(own, robot, args.envs, seed=args.seed, privileged=config.privileged,
+                         **{name: value for name, value in world.items() if name != 'envs'})
+    folder = train(env, config, args.out, info=_info(args, robot, graph), resume=args.resume,
+                   init=args.checkpoint,
+                   pairs=lambda: place.make_pairs(own, others, robot, args.seed))
+    _evaluate(args, place, folder, given, robot, dict(zip(SPLITS, (own, others), strict=True)))
+    print(folder)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    rules = (
+        (args.minutes > 0, 'there is some time to learn', args.minutes, 'raise --minutes'),
+        (args.goals >= 4, 'there are at least four goals', args.goals, 'raise --goals'),
+        (args.episodes >= 1, 'there is at least one episode', args.episodes, 'raise --episodes'),
+        (args.envs >= 1, 'there is at least one robot', args.envs, 'raise --envs'),
+        (args.size is None or args.checkpoint is None, 'the size is that of the checkpoint',
+         args.size, 'leave out --size'),
+        (args.resume or not (args.out / STATE).is_file(), 'a new run has a folder of its own',
+         str(args.out), 'go on there with --resume, or choose another folder'),
+    )
+    for kept, rule, received, remedy in rules:
+        if not kept:
+            raise UserError(rule, received, remedy)
+
+
+def _config(args: argparse.Namespace, given: LoadedCheckpoint | None) -> TrainConfig:
+    """The preset's numbers, for the network of a checkpoint if there is one."""
+    own = {'frames': 10**9, 'minutes': args.minutes, **TEACHER}
+    if given is None:
+        own |= FROM_NOTHING | {'pair_minutes': PAIR_SHARE * args.minutes}
+    else:
+        network = given.config
+        if network.architecture == 'icra2017':
+            raise UserError('an encoder that learns is taught', f'{args.checkpoint}, whose '
+                            'encoder is frozen', 'choose another --checkpoint')
+        own |= {'pair_minutes': 0.0, 'stacked_frames': network.frames,
+                'track_goal': bool(network.moves), **{name: getattr(network, name) for name in (
+                    'architecture', 'channels', 'blocks', 'features', 'hidden', 'deconvolutions',
+                    'pose_to_memory', 'pixel_mean', 'pixel_std')}}
+    words = [f'{name}={value!r}' for name, value in own.items()]
+    return train_config(argparse.Namespace(**dict.fromkeys(CHANGES) | {
+        'preset': PRESET, 'set': [*words, *args.set], 'seed': args.seed, 'no_tensorboard': True,
+        'threads': args.threads}))
+
+
+def _robot(args: argparse.Namespace, given: LoadedCheckpoint | None) -> RobotSpec:
+    """The robot with the actions of the policy."""
+    robot = load_robot(args.robot) if args.robot else RobotSpec()
+    if given is None:
+        return robot.with_actions(DRIVE_ACTIONS)
+    before = given.info['camera_fov_deg'], given.info['camera_height']
+    now = math.degrees(robot.camera_fov), robot.camera_height
+    if any(abs(a - b) > 0.01 * b for a, b in zip(now, before, strict=True)):
+        print(f'the camera is another one ({now[0]:.0f} deg, {now[1]:g} m high) than the policy '
+              f'has learned with ({before[0]:.0f} deg, {before[1]:g} m): it gets used to it',
+              flush=True)
+    return robot.with_actions(given.config.actions, given.config.moves)
+
+
+def _graph(args: argparse.Namespace, place: Place, robot: RobotSpec, size: int):
+    """The place out of the bag."""
+    topics = load_topics(args.topics) if args.topics else Topics()
+    cache = args.cache or args.out / 'decoded'
+    drives = load_drives(args.bag, Wanted(robot, size, topics, every=True), cache)
+    facts = drives.facts
+    print(f'{args.bag}: {len(drives):,} pictures with poses in {facts["episodes"]:,} '
+          f'stretch{"es" * (facts["episodes"] > 1)}; {facts["without_pose"]:,} without a pose, '
+          f'{facts["jumps"]:,} jumps', flush=True)
+    return place.build_graph(
+        drives.image, _poses(args, drives, robot, topics, cache), drives.episode, robot,
+        depth=drives.depth,
+        farthest=MAX_DEPTH, goals=args.goals, goal_pictures=drives.goals,
+        margin=place.MARGIN if args.margin is None else args.margin, seed=args.seed,
+        world_version=str(scene_of(args.bag).get('world_version', RECORDED)))
+
+
+def _poses(args: argparse.Namespace, drives: DriveSet, robot: RobotSpec, topics: Topics,
+           cache: Path) -> np.ndarray:
+    """Where the pictures were taken, [N,3]: by odometry, straightened if that is asked for.
+
+    Larger pictures than the network's tell more exactly.
+    """
+    if not args.straighten:
+        return drives.pose
+    large = drives
+    if drives.image.shape[-1] < LOOKED_AT:
+        large = load_drives(args.bag, Wanted(robot, LOOKED_AT, topics, every=True), cache)
+    found = straighten(large, robot)
+    facts = found.facts
+    if facts['corrected']:
+        print(f'odometry is straightened: {facts["closures"]:,} times the robot saw a place '
+              f'again; poses moved by up to {facts["moved"]:.2f} m and '
+              f'{math.degrees(facts["turned"]):.0f} deg', flush=True)
+    else:
+        print('odometry stays as it is: too few places are recognised when seen again', flush=True)
+    return found.poses
+
+
+def _info(args: argparse.Namespace, robot: RobotSpec, graph) -> dict:
+    return {
+        'camera_fov_deg': math.degrees(robot.camera_fov), 'camera_height': robot.camera_height,
+        'world_version': graph.world_version, 'preset': PRESET, 'stop_threshold': None,
+        'command': 'vn_nav ' + shlex.join(word for word in sys.argv[1:] if word != '--resume'),
+        'notes': f'Taught in the pictures of {args.bag.name}: {"; ".join(graph.words)}.'}
+
+
+def _evaluate(args: argparse.Namespace, place: Place, folder: Path,
+              given: LoadedCheckpoint | None, robot: RobotSpec, graphs: dict) -> None:
+    """Measure the policy in the place, print, and write figures, page and checkpoint."""
+    taught = load_checkpoint(folder)
+    threshold = (given.info['stop_threshold'] if given else None) or evaluator.STOP_THRESHOLD
+    result = {
+        'checkpoint': str(folder), 'world_version': taught.info['world_version'],
+        'task': 'image', 'decoding': 'sample', 'seed': EVALUATION_SEED,
+        'max_decisions': ENVIRONMENT[PRESET]['max_decisions'],
+        'date': datetime.date.today().isoformat(), 'splits': {}}
+    measured, plans = {}, {}
+    for name, graph in graphs.items():
+        if graph is None:
+            continue
+        measured[name] = _measure(args, place, graph, robot, taught.network, CONTROLS, threshold)
+        if given is not None:
+            for stop, rows in _measure(args, place, graph, robot, given.network, (),
+                                       threshold).items():
+                measured[name][stop][BEFORE], = rows.values()
+        plans[name] = {graph.seed: graph.floor_plan()}
+        result['splits'][name] = {
+            'houses': [graph.seed], 'rows': evaluator.figures(measured[name]),
+            'scenes': {str(graph.seed): evaluator.figures(measured[name])}}
+        tables.print_rows(result['splits'][name]['rows'], f'{args.out}, {tables.SPLITS[name]}')
+    info = {key: value for key, value in taught.info.items() if key != 'sha256'}
+    info['results'] = {
+        f'{name}: {stop}, {row}': figures for name, split in result['splits'].items()
+        for stop, own in split['rows'].items() for row, figures in own.items()}
+    if 'arrival' in taught.config.heads:
+        info['stop_threshold'] = threshold
+    save_checkpoint(folder, taught.network, info)
+    write_file(args.out / 'evaluation.json', json.dumps(result, indent=2).encode())
+    write_file(args.out / 'evaluation.html', evaluation_page(result, measured, plans).encode())
+
+
+def _measure(args: argparse.Namespace, place: Place, graph, robot: RobotSpec, network: Policy,
+             controls, threshold: float) -> evaluator.Rows:
+    def make(_, envs: int, stop: str):
+        return place.make_env(graph, robot, envs, stop=stop,
+                              max_decisions=ENVIRONMENT[PRESET]['max_decisions'])
+    return evaluator.measure(make, network, [graph.seed], decoding='sample',
+                             episodes=args.episodes, controls=controls, threshold=threshold,
+                             seed=EVALUATION_SEED, robot=robot)
