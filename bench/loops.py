@@ -37,6 +37,7 @@ ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 RATE = 8.0  # pictures a second
 SPACING, REACH = 0.9, 1.5  # m between places of the tour, and at most along one stretch of it
 FALSE = (0.5, math.radians(10))  # m, rad
+FAR = 2.5  # m
 BATCH = 64  # pictures that are rendered at a time
 
 
@@ -179,8 +180,11 @@ def errors(poses: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]:
 
 def false(closures: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Which closures are not true, [K] bool."""
-    gap = between(truth[closures['first']], truth[closures['second']]) - closures['motion']
-    return (np.hypot(gap[:, 0], gap[:, 1]) > FALSE[0]) | (np.abs(wrap_angle(gap[:, 2])) > FALSE[1])
+    real, stated = between(truth[closures['first']], truth[closures['second']]), closures['motion']
+    ahead = stated[:, :2] / np.maximum(np.hypot(stated[:, 0], stated[:, 1]), 1e-9)[:, None]
+    across = np.abs(real[:, 0] * ahead[:, 1] - real[:, 1] * ahead[:, 0])
+    return ((across > FALSE[0]) | (np.hypot(real[:, 0], real[:, 1]) > FAR)
+            | (np.abs(wrap_angle(real[:, 2] - stated[:, 2])) > FALSE[1]))
 
 
 def main():
@@ -212,9 +216,9 @@ def _compare(house: int, driven: Drive, factor: float, arguments: argparse.Names
     drives = SimpleNamespace(
         image=driven.image, pose=odometry, time=driven.time,
         episode=np.zeros(len(odometry), np.int64), depth=driven.depth if arguments.depth else None)
-    begun = time.perf_counter()
+    begun = time.process_time()
     made = straighten(drives, ROBOT)
-    spent = time.perf_counter() - begun
+    spent = time.process_time() - begun
     before, after = errors(odometry, driven.pose), errors(made.poses, driven.pose)
     print(f'{house:5} {driven.image.shape[-1]:4} {factor:5.1f} {len(odometry):8} | '
           f'{before[0]:12.2f} {before[1]:7.2f} {before[2]:5.1f} | '

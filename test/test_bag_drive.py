@@ -413,5 +413,3 @@ def test_somebody_who_comes_ends_it(long_drive, stranger, listens):
     assert 'stranger' in said or listens and 'which listens to' in said
     assert 'Traceback' not in said
     assert_every_reader_accepts(out)
-
-

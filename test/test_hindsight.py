@@ -23,6 +23,7 @@ from vn_sim_bridge.env import EnvConfig, NavigationEnv
 
 STEPS = 100  # of a robot in a house
 
+
 def some_drives(*, depth=True):
     """Two bags, one with and one without a motion that fits no action."""
     first, second = drive_set(5, depth=depth), drive_set(4, seed=1, depth=depth)

@@ -288,4 +288,3 @@ def _key(bag: Path, wanted: Wanted) -> str:
         str(bag.resolve()), wanted.robot.moves, wanted.robot.camera_fov, wanted.size,
         wanted.topics, wanted.every)).encode())
     return digest.hexdigest()[:24]
-

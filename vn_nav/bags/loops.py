@@ -44,7 +44,8 @@ EACH = 5  # candidates of a keyframe in a round
 MATCHES, SHARE = 15, 0.45  # that must agree, and of all matches
 VAGUE = math.radians(6)  # rad: standard deviation of a heading that is not worth a closure
 ATTACHED = (0.01, 0.01, 0.006)  # m, m, rad: odometry between keyframes and their nodes
-ALIKE = 4.0  # closures that say the same: closures of one place share their errors
+WRONG = 4.0  # times the covariance of a closure, for what its model leaves out,
+ALIKE = 2.5  # and in the graph: closures of one place share their errors
 BESIDE = 6  # keyframes between closures that support each other
 BESIDE_ODOMETRY = (0.05, 0.05, 0.02)  # m, m, rad: standard deviations of odometry on the way
 FEWEST = 5  # closures, or odometry stays as it is
@@ -212,8 +213,9 @@ class _Found:
         edges = self.edges()
         self.kept = self._supported(edges, np.ones(len(self.closures), bool))
         while True:  # at each turn there are fewer
-            solution = solve(solution.poses, self._drive.edges, edges.take(self.kept),
-                             solution.shares)
+            kept = edges.take(self.kept)
+            solution = solve(solution.poses, self._drive.edges,
+                             kept._replace(covariance=ALIKE * kept.covariance), solution.shares)
             wrong = solution.chi > GATE
             if not wrong.any():
                 return solution
@@ -262,7 +264,7 @@ class _Found:
             length, math.hypot(*expected[:2]))
         covariance = (seen.covariance + one.scale**2 * np.outer(along, along)
                       + np.diag(ATTACHED)**2)
-        return _Closure(first, second, seen.matches, seen.motion, ALIKE * covariance)
+        return _Closure(first, second, seen.matches, seen.motion, WRONG * covariance)
 
     def _supported(self, edges: Edges, among: np.ndarray) -> np.ndarray:
         """Which closures another one of `among` [K] beside them supports, [K] bool."""

@@ -212,10 +212,10 @@ def unpacked(body: bytes) -> tuple[bytes, tuple[int, int]]:
         data = _inflate(stored, compression, size)
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
         raise Damage(f'a chunk cannot be decompressed ({compression}): {words(error)}',
-                      whole=True, cost=cost) from error
+                     whole=True, cost=cost) from error
     if len(data) != size:
         raise Damage(f'a chunk declares {size} bytes and holds another number', whole=True,
-                      cost=cost)
+                     cost=cost)
     if crc and zlib.crc32(data) != crc:
         raise Damage('the checksum of a chunk does not match', whole=True, cost=cost)
     return data, (start, end)
@@ -253,10 +253,10 @@ def records(data: bytes, declared: Declared) -> Iterator[Message]:
             stop = at + length - (size - HEAD.size)
             if not at <= stop <= end or log_time > MAX_TIME or publish_time > MAX_TIME:
                 raise Damage(f'a message declares {length} bytes and the times {log_time} and '
-                              f'{publish_time} ns', whole=True)
+                             f'{publish_time} ns', whole=True)
             if channel not in chosen:
                 raise Damage(f'a message is of channel {channel}, which nothing declares',
-                              whole=True)
+                             whole=True)
             connection = chosen[channel]
             if connection is not None:
                 yield Message(connection, sequence, log_time, publish_time, data[at:stop])
@@ -266,7 +266,7 @@ def records(data: bytes, declared: Declared) -> Iterator[Message]:
         opcode, length = fields.numbers(HEAD)
         if length > fields.left or opcode not in (SCHEMA, CHANNEL) and opcode < PRIVATE:
             raise Damage(f'a chunk holds a record of kind {opcode} with {length} bytes',
-                          whole=True)
+                         whole=True)
         at = fields.at + length
         if opcode in (SCHEMA, CHANNEL):
             fields = Fields(data[fields.at:at])

@@ -153,9 +153,9 @@ def _equations(poses, shares, odometry: Edges, closures: Edges, weight: np.ndarr
     blocks, slope = np.zeros((len(poses), 3, len(poses), 3)), np.zeros((len(poses), 3))
     beside, down = np.zeros((len(poses), 3, 3)), np.zeros(size + 3)
     information = np.zeros((size + 3, size + 3))
-    for edges, acts, trust in ((odometry, ODOMETRY, 1.0), (closures, CLOSURES, weight)):
+    for edges, acts, trust in ((odometry, ODOMETRY, 1.0),
+                               (closures, CLOSURES, weight[:, None, None])):
         error, _, one, other, seen = _errors(poses, edges, acts @ shares, lean=False)
-        trust = np.broadcast_to(trust, len(error))[:, None, None]
         inverse = trust * np.linalg.inv(edges.covariance)
         by_shares = seen[:, :, None] * acts
         sides = ((edges.first, one), (edges.second, other))

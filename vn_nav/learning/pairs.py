@@ -154,7 +154,7 @@ def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
 
 
 def look(network: Policy, views: np.ndarray, first: np.ndarray, second: np.ndarray
-          ) -> tuple[Pose, Tensor]:
+         ) -> tuple[Pose, Tensor]:
     """What a network says of pairs of views, and its maps; every view is encoded once.
 
     Args:
