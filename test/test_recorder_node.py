@@ -177,7 +177,7 @@ def test_a_disk_that_fails_ends_the_recording_and_not_the_node(talker, tmp_path)
 
 
 def test_what_is_published_is_recorded_as_it_is_published(talker, tmp_path):
-    """TwistStamped commands, a best-effort odometry, a foreign topic by name, and all others."""
+    """A TwistStamped command, a best-effort odometry, a foreign topic by name, and all others."""
     messages = {
         'cmd_vel': (TwistStamped, 10), 'odom': (Odometry, qos_profile_sensor_data),
         '/front/scan': (LaserScan, qos_profile_sensor_data), '/words': (String, 10)}
