@@ -38,6 +38,7 @@ from vn_nav.robot import RobotSpec
 TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
 UNSEEN_HOUSE = 8  # seed
 SEED = 2026  # of starts and goals
+HEARS = 20.0  # s until the recorder has met a node
 STALL = 60.0  # s without a finished episode after which the demo gives up
 LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up|stopped elsewhere) after (\d+) '
                   r'decisions, ([\d.]+) m')
@@ -177,14 +178,16 @@ def _drive(console: Console, processes: Processes, checkpoint: Path, info: dict,
     bridge, policy = f'bridge_{place}', f'policy_{place}'
     note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
     console.print(f'\n[bold]{place} house[/], seed {house}{note}')
+    processes.start(policy, 'vn_nav.nodes.policy_node', {
+        'checkpoint': str(checkpoint), 'robot': base, 'time': 'lock_step', 'auto_enable': True,
+        'seed': SEED}, (f'__node:={policy}',))
+    # A robot that is where it wants to be at once would be gone before the recorder has met it.
+    _wait_until_heard(processes, policy)
     processes.start(bridge, 'vn_sim_bridge.bridge_node', {
         'house': house, 'rooms': info['rooms'], 'randomisation': info['randomisation'],
         'robot': base, 'time': 'lock_step', 'seed': SEED,
         'episodes': count, 'max_decisions': limit, 'exit_when_done': True,
         'stop': _stop(info), 'start_time': start_time})
-    processes.start(policy, 'vn_nav.nodes.policy_node', {
-        'checkpoint': str(checkpoint), 'robot': base, 'time': 'lock_step', 'auto_enable': True,
-        'seed': SEED})
     seen, progress = 0, time.monotonic()
     with Live(_progress([], count), console=console, refresh_per_second=8) as live:
         while True:
@@ -205,6 +208,16 @@ def _drive(console: Console, processes: Processes, checkpoint: Path, info: dict,
             time.sleep(0.1)
     processes.stop(policy)
     processes.stop(bridge)
+
+
+def _wait_until_heard(processes: Processes, name: str) -> None:
+    until = time.monotonic() + HEARS
+    while f'hears /{name}\n' not in processes.log('recorder'):
+        for child in ('recorder', name):
+            processes.check(child)
+        if time.monotonic() > until:
+            raise ProcessFailure(f'the recorder has not met {name} within {HEARS:.0f} s')
+        time.sleep(0.05)
 
 
 def _stop(info: dict) -> str:

@@ -85,6 +85,7 @@ class RecorderNode(Node):
                                                  qos('/diagnostics'))
         self.stopped = False
         self.said: set[str] = set()  # what is said once
+        self.heard: set[str] = set()  # nodes that publish what is recorded
         self.lost_said = 0
         self.look_at = self.report_at = time.monotonic()
         self.taps: dict[str, Tap] = {}  # by resolved name
@@ -212,6 +213,10 @@ class RecorderNode(Node):
         """Subscribe anew where a topic is published as another type, or with a weaker QoS."""
         offers = self._offers(tap.name)
         mine = [offer for offer in offers if offer.topic_type == tap.topic.type]
+        for name in sorted({f'{offer.node_namespace.rstrip("/")}/{offer.node_name}'
+                            for offer in mine} - self.heard):
+            self.heard.add(name)
+            self.get_logger().info(f'hears {name}')
         tap.publishers = max(len(mine), 1)
         entry = tap.topic
         if foreign := sorted({offer.topic_type for offer in offers} - {entry.type}):
