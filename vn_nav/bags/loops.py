@@ -40,12 +40,16 @@ APART = (1.0, math.pi)  # m driven or rad turned that lie between the two pictur
 REACH = (1.2, math.radians(35))  # m, rad: farther, two pictures have too little in common
 SURE = (0.4, math.radians(8))  # m, rad: standard deviations of candidates in a round,
 ROUNDS = (1, 1, 1, 2, 4, 8)  # times that
+DOUBT = (0.1, math.radians(2))  # m, rad: of what is known before, at least
 EACH = 5  # candidates of a keyframe in a round
 MATCHES, SHARE = 15, 0.45  # that must agree, and of all matches
 VAGUE = math.radians(6)  # rad: standard deviation of a heading that is not worth a closure
 ATTACHED = (0.01, 0.01, 0.006)  # m, m, rad: odometry between keyframes and their nodes
 WRONG = 4.0  # times the covariance of a closure, for what its model leaves out,
 ALIKE = 2.5  # and in the graph: closures of one place share their errors
+# A turn on the spot that ends where it began shows how good odometry's heading is: at most so far
+# apart [m], so many of them, and by these factors at most it is another than expected.
+SPOT, TURNS, FACTOR = (0.15, 1.0), 10, (0.4, 2.5)
 BESIDE = 6  # keyframes between closures that support each other
 BESIDE_ODOMETRY = (0.05, 0.05, 0.02)  # m, m, rad: standard deviations of odometry on the way
 FEWEST = 5  # closures, or odometry stays as it is
@@ -102,9 +106,9 @@ class _Drive:
         ways = np.hypot(steps[:, 0], steps[:, 1])
         carried = (np.diff(drives.episode) != 0) & (
             (np.diff(drives.time) > GAP) | (ways > JUMP))
-        self.way, self.turn = (
+        self.way, self.turn, self.net = (  # m driven, rad turned, rad to the left, [N]
             np.append(0.0, np.cumsum(np.where(carried, 0.0, moved)))
-            for moved in (ways, np.abs(steps[:, 2])))
+            for moved in (ways, np.abs(steps[:, 2]), steps[:, 2]))
         part = np.append(0, np.cumsum(carried))
         self.key = self._every(KEY, part)  # pictures [K]
         self.node = self._every(NODE, part)  # pictures [A]
@@ -197,9 +201,9 @@ class _Found:
         poses = self._drive.spread(solution.poses)[self._drive.key]
         covariance = solution.covariance()
         fresh = []
-        for pair, turn in self._candidates(poses, covariance, loosen):
+        for pair, *doubt in self._candidates(poses, covariance, loosen):
             self.tested.add(pair)
-            closure = self._compare(*pair, between(poses[pair[0]], poses[pair[1]]), turn)
+            closure = self._compare(*pair, between(poses[pair[0]], poses[pair[1]]), *doubt)
             if closure is not None:
                 fresh.append(closure)
         if fresh:
@@ -210,17 +214,39 @@ class _Found:
 
     def settle(self, solution: Solution) -> Solution:
         """Poses by all closures that hold."""
-        edges = self.edges()
+        edges, odometry = self.edges(), self._odometry(solution)
         self.kept = self._supported(edges, np.ones(len(self.closures), bool))
         while True:  # at each turn there are fewer
             kept = edges.take(self.kept)
-            solution = solve(solution.poses, self._drive.edges,
-                             kept._replace(covariance=ALIKE * kept.covariance), solution.shares)
+            solution = solve(
+                solution.poses, odometry, kept._replace(covariance=ALIKE * kept.covariance),
+                self._drive.features[0].scale, solution.shares)
             wrong = solution.chi > GATE
             if not wrong.any():
                 return solution
             self.kept[np.flatnonzero(self.kept)[wrong]] = False
             self.kept &= self._supported(edges, self.kept)
+
+    def _odometry(self, solution: Solution) -> Edges:
+        """That of the drive, as uncertain as turns on the spot show it to be."""
+        drive = self._drive
+        first, second = drive.key[self._ends()]
+        way, turn = drive.way[second] - drive.way[first], drive.turn[second] - drive.turn[first]
+        motion = np.array([closure.motion for closure in self.closures])
+        spot = (np.hypot(motion[:, 0], motion[:, 1]) < SPOT[0]) & (way < SPOT[1])
+        if spot.sum() < TURNS:
+            return drive.edges
+        said = between(drive.odometry[first], drive.odometry[second])
+        covariance = odometry_covariance(said, way, turn)
+        known = solution.shares[1] * (drive.net[second] - drive.net[first])
+        off = np.abs(wrap_angle(motion[:, 2] - said[:, 2] + known))[spot]
+        factor = np.median(off / np.sqrt(covariance[spot, 2, 2])) / 0.6745  # if it is normal
+        factor = np.clip(factor, *FACTOR)
+        return drive.edges._replace(covariance=factor**2 * drive.edges.covariance)
+
+    def _ends(self) -> np.ndarray:
+        """First and second keyframe of all closures, [2,K]."""
+        return np.array([closure[:2] for closure in self.closures], np.int64).reshape(-1, 2).T
 
     def _edges(self, closures: list[_Closure]) -> Edges:
         drive = self._drive
@@ -230,8 +256,8 @@ class _Found:
                      np.array([c.covariance for c in closures]).reshape(-1, 3, 3))
 
     def _candidates(self, poses: np.ndarray, covariance: np.ndarray, loosen: float
-                    ) -> Iterator[tuple[tuple[int, int], float]]:
-        """Pairs of keyframes that may show one place, and how far the heading may lie off."""
+                    ) -> Iterator[tuple[tuple[int, int], float, float]]:
+        """Pairs of keyframes that may show one place; how well place and heading are known."""
         drive = self._drive
         way, turn = drive.way[drive.key], drive.turn[drive.key]
         place = covariance[:, 0, :, 0] + covariance[:, 1, :, 1]
@@ -249,12 +275,13 @@ class _Found:
             order = [k for k in np.flatnonzero(good)[np.argsort(cost[good])]
                      if (int(past[k]), i) not in self.tested]
             for k in order[:EACH]:
-                yield (int(past[k]), i), 3 * float(twist[k]) + math.radians(4)
+                yield (int(past[k]), i), float(off[k]), float(twist[k])
 
-    def _compare(self, first: int, second: int, expected: np.ndarray, turn: float
-                 ) -> _Closure | None:
+    def _compare(self, first: int, second: int, expected: np.ndarray, place: float,
+                 heading: float) -> _Closure | None:
         one, other = self._drive.features[first], self._drive.features[second]
-        seen = self._drive.camera.relate(one, other, float(expected[2]), turn)
+        seen = self._drive.camera.relate(
+            one, other, expected, math.hypot(place, DOUBT[0]), math.hypot(heading, DOUBT[1]))
         if (seen is None or seen.matches < max(MATCHES, SHARE * seen.tried)
                 or seen.covariance[2, 2] > VAGUE**2):
             return None
@@ -268,7 +295,7 @@ class _Found:
 
     def _supported(self, edges: Edges, among: np.ndarray) -> np.ndarray:
         """Which closures another one of `among` [K] beside them supports, [K] bool."""
-        first, second = (np.array([c[k] for c in self.closures], np.int64) for k in (0, 1))
+        first, second = self._ends()
         odometry = self._drive.odometry[self._drive.key]
         order = np.argsort(first, kind='stable')
         out = np.zeros(len(order), bool)

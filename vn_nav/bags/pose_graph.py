@@ -16,8 +16,7 @@ import numpy as np
 from vn_nav.arrival import wrap_angle
 
 GATE = 16.3  # chi^2 of a measurement, 3 degrees of freedom, 99.9 %
-# Standard deviations of the shares: ways and turns of odometry, motions of closures.
-SHARES = (0.02, 0.01, 0.5)
+WAYS, TURNS = 0.02, 0.01  # standard deviations of the shares of odometry
 ODOMETRY = np.array([[1, 0, 0], [1, 0, 0], [0, 1.0, 0]])  # which share acts on x, y and yaw
 CLOSURES = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])
 HELD = 1e9  # information that holds the first pose
@@ -69,22 +68,24 @@ def between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
                     axis=-1)
 
 
-def solve(poses: np.ndarray, odometry: Edges, closures: Edges, shares: np.ndarray | None = None
-          ) -> Solution:
+def solve(poses: np.ndarray, odometry: Edges, closures: Edges, scale: float = 0.4,
+          shares: np.ndarray | None = None) -> Solution:
     """The poses that agree best.
 
     Args:
         poses: [A,3] to begin with; the first stays.
         odometry: from each node to the next; is believed.
         closures: the others; may be wrong.
+        scale: standard deviation of the share of closures.
         shares: [3] to begin with.
     """
+    prior = np.array([WAYS, TURNS, scale])**-2.0
     poses, shares = poses.copy(), np.zeros(3) if shares is None else shares.copy()
     chi = _errors(poses, closures, CLOSURES @ shares)[1]
     wide = max(1.0, 2 * float(chi.max(initial=0.0)) / GATE)
     for _ in range(60):
         weight = (wide * GATE / (wide * GATE + chi))**2
-        information, slope = _equations(poses, shares, odometry, closures, weight)
+        information, slope = _equations(poses, shares, prior, odometry, closures, weight)
         step = np.linalg.solve(information, slope)
         poses = poses + step[:-3].reshape(-1, 3)
         shares = shares + step[-3:]
@@ -146,7 +147,7 @@ def _lever(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
     return out
 
 
-def _equations(poses, shares, odometry: Edges, closures: Edges, weight: np.ndarray
+def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations of a step."""
     size = 3 * len(poses)
@@ -172,7 +173,6 @@ def _equations(poses, shares, odometry: Edges, closures: Edges, weight: np.ndarr
     information[:size, :size] = blocks.reshape(size, size)
     information[:size, size:] = beside.reshape(size, 3)
     information[size:, :size] = information[:size, size:].T
-    prior = np.array(SHARES)**-2.0
     information[size:, size:] += np.diag(prior)
     down[:size] = slope.reshape(-1)
     down[size:] -= prior * shares
@@ -182,16 +182,16 @@ def _equations(poses, shares, odometry: Edges, closures: Edges, weight: np.ndarr
 def odometry_covariance(motion: np.ndarray, way: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Of short motions by odometry, [E,3,3].
 
-    Generous, three times the standard deviations of a good indoor robot (the odometry model of
-    Thrun, Burgard and Fox, "Probabilistic Robotics", 2005, 5.4, with variances by the way), but
-    for the way itself.
+    The odometry model of Thrun, Burgard and Fox ("Probabilistic Robotics", 2005, 5.4) with
+    variances by the way: for the heading with three times the standard deviations of a good
+    indoor robot.
 
     Args:
         motion: [E,3] of the robot.
         way, turn: [E] that it drove and turned on the way [m], [rad].
     """
     heading = 1e-4 * turn + 4e-4 * way
-    along = 1e-3 * way + 2e-4 * turn
+    along = 4e-4 * way + 2e-4 * turn
     # A turn somewhere on the way: half of it acts on the motion.
     lever = np.stack([-motion[:, 1] / 2, motion[:, 0] / 2, np.ones(len(motion))], axis=1)
     return (along[:, None, None] * np.diag([1.0, 1.0, 0.0]) + 1e-6 * np.eye(3)

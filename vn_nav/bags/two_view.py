@@ -91,34 +91,39 @@ class Camera:
         slope = np.stack([left / ahead, (c * up - s) / ahead], axis=1)
         return Features(slope, found.astype(np.float32), known, scale)
 
-    def relate(self, one: Features, other: Features, heading: float = 0.0,
-               turn: float = math.pi) -> Motion | None:
+    def relate(self, one: Features, other: Features, expected: np.ndarray,
+               place: float, heading: float) -> Motion | None:
         """The motion between two pictures; None: they have too little in common.
 
         Args:
             one, other: features of the two.
-            heading, turn: of the second as the first sees it, and by how much it may be another
-                [rad].
+            expected: [3] what the motion should be.
+            place, heading: by how much it may be another [m], [rad]; standard deviations.
         """
         pairs = match(one.descriptor, other.descriptor)
         if len(pairs) < FEWEST:
             return None
         return relate(one.slope[pairs[:, 0]], other.slope[pairs[:, 1]], one.depth[pairs[:, 0]],
-                      heading + np.arange(-turn, turn + HEADING, HEADING), self._focal)
+                      self._focal, expected, place, heading)
 
 
-def relate(first: np.ndarray, second: np.ndarray, depth: np.ndarray, yaws: np.ndarray,
-           focal: float) -> Motion:
+def relate(first: np.ndarray, second: np.ndarray, depth: np.ndarray, focal: float,
+           expected: np.ndarray, place: float, heading: float) -> Motion:
     """The motion with which most matches agree.
+
+    Several motions may fit a single wall, or a pattern that repeats: of those, the search takes
+    the one that is expected. The motion itself, and its covariance, are of the matches alone.
 
     Args:
         first, second: [M,2] slopes of the same points in the two pictures, as in `Features`.
         depth: [M,2] of the points as the first robot sees them.
-        yaws: [Y] headings of the second robot to try [rad].
         focal: length [pixels], for the noise.
+        expected, place, heading: as in `Camera.relate`.
     """
-    start = _search(first, second, depth, yaws, BEARINGS, OFF / focal)
-    motion, now = start.copy(), depth.copy()
+    reach = 3 * heading + HEADING
+    yaws = expected[2] + np.arange(-reach, reach + HEADING, HEADING)
+    motion = _search(first, second, depth, yaws, BEARINGS, OFF / focal, expected, place, heading)
+    now = depth.copy()
     chi, normal, occam = np.zeros(len(first)), np.zeros((3, 4)), np.zeros((3, 4))
     for wide in WIDTHS:  # Gauss and Newton; matches weigh by a kernel that narrows
         _equations(first, second, depth, now, (PIXELS / focal)**2, motion, wide, chi, normal,
@@ -149,16 +154,19 @@ def match(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _search(first, second, depth, yaws, bearings, off):
+def _search(first, second, depth, yaws, bearings, off, expected, place, turn):
     """The motion [3] with which most matches agree, from all headings and bearings.
 
     Each match says how far the motion went, as a share of its depth.
     """
-    best, heading, bearing = -1.0, 0.0, 0.0
+    best, heading, bearing = -1e9, 0.0, 0.0
     for yaw in yaws:
         for step in range(bearings):
             angle = 2 * math.pi * step / bearings
-            score = 0.0
+            # Matches, less by how far the motion leaves aside what is expected.
+            along = expected[0] * math.cos(angle) + expected[1] * math.sin(angle)
+            across = expected[0]**2 + expected[1]**2 - max(along, 0.0)**2
+            score = -0.5 * (across / place**2 + ((yaw - expected[2]) / turn)**2)
             for k in range(len(first)):
                 _, wrong = _way(first[k], second[k], yaw, angle, off)
                 if wrong < 1.0:
