@@ -60,12 +60,12 @@ def read(folder: Path) -> list[dict]:
         return list(csv.DictReader(file))
 
 
-def keep_curve(folder: Path) -> None:
-    """Write a run's curve where it is versioned, with at most `ROWS` rows."""
+def keep_curve(folder: Path, curves: Path = CURVES) -> None:
+    """Write a run's curve into a versioned folder, with at most `ROWS` rows."""
     rows = read(folder)
     every = max(1, -(-len(rows) // ROWS))
     thinned = rows[::-every][::-1]  # the last row is among them
-    target = CURVES / folder.name / 'metrics.csv'
+    target = curves / folder.name / 'metrics.csv'
     target.parent.mkdir(parents=True, exist_ok=True)
     with open(target, 'w', newline='') as file:
         writer = csv.DictWriter(file, rows[0].keys())
