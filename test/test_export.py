@@ -28,6 +28,7 @@ NETWORKS = {
     'thesis at 174': {'architecture': 'thesis', 'size': 174},
     'unreal': {'architecture': 'unreal'},
     'framestack': {'architecture': 'thesis', 'frames': 4},
+    'taught a place': {'architecture': 'matching', 'places': 8},
     'icra2017': {'architecture': 'icra2017', 'frames': 4},
     'icra2017 in scenes': {'architecture': 'icra2017', 'frames': 4, 'scenes': 3},
     'icra2017 of one frame': {'architecture': 'icra2017'},

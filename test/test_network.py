@@ -299,7 +299,7 @@ def somewhere(network, envs):
 @pytest.mark.parametrize('architecture, frames', EVERY)
 def test_stepwise_equals_the_sequence_across_resets(architecture, frames):
     network = changed(architecture, frames, heads=('goal_pose', 'arrival'), pose_to_memory=True,
-                      moves=MOVES if frames == 1 else ())
+                      moves=MOVES if frames == 1 else (), places=5 if frames == 1 else 0)
     observation, starts = batch()
     state = somewhere(network, 3)
     whole, last = network(observation, starts, state)
@@ -443,7 +443,7 @@ def test_shapes_follow_the_configuration(size, architecture):
     {'actions': ('forward',)}, {'actions': ('left', 'left')}, {'size': 20},
     {'architecture': 'resnet'}, {'channels': (8, 8)}, {'hidden': 0}, {'blocks': 9},
     {'frames': 0}, {'heads': ('pose',)}, {'heads': ('depth', 'depth')}, {'deconvolutions': 3},
-    {'pose_to_memory': True}, {'pixel_std': 0.0}])
+    {'pose_to_memory': True}, {'pixel_std': 0.0}, {'places': 1}, {'places': 4, 'frames': 2}])
 def test_bad_networks_are_refused(field):
     with pytest.raises(UserError, match='correct the network configuration'):
         dataclasses.replace(SMALL, **field)

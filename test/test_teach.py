@@ -136,6 +136,7 @@ def test_picture_pairs_come_first_and_after_the_weights_of_a_checkpoint(graph, t
     (['--goals', '1'], 'at least four goals'),
     (['--checkpoint', 'models/house', '--size', '32'], 'size is that of the checkpoint'),
     (['--checkpoint', 'nowhere'], 'a checkpoint is a folder'),
+    (['--places', '1'], '2 to 1024 spots'),
     (['--robot', 'nowhere.yaml'], 'a robot file exists'),
     (['--topics', 'nowhere.yaml'], 'in a YAML file'),
     (['--set', 'teacher=nobody'], 'the teacher is one of'),

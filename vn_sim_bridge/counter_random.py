@@ -34,6 +34,9 @@ class Stream(enum.IntEnum):
     PAIR_APPEARANCE = 17
     PAIR_SENSOR = 18
     ODOMETRY = 19  # errors of odometry
+    VIEW = 20  # of a recorded place
+    VIEW_APPEARANCE = 21
+    EDGE = 22  # how a recorded place ends
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

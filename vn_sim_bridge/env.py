@@ -30,7 +30,7 @@ from vn_sim_bridge.world import motion_noise
 
 TASKS = ('image', 'object', 'room', 'collect')
 PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
-              'overlap', 'explorer_action')
+              'overlap', 'explorer_action', 'oracle_regret')
 STOPS = ('arrival', 'declared')
 SQUARE = 1.0  # m, side of the squares of floor that exploration counts
 BATCH = 256  # goal pictures drawn at a time: few need little memory
@@ -197,6 +197,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
              'objects: its task is image', config.task),
             (can.scene or 'explorer_action' not in told, 'the backend knows no walls, which the '
              'explorer needs', 'explorer_action'),
+            (backend.routes is not None or 'oracle_regret' not in told,
+             'the backend knows what each action costs on the ways there (as an image graph does)',
+             'oracle_regret'),
             (can.depth or 'depth' not in told, 'the backend has depth pictures', 'none'),
             (can.labels or not told & {'segmentation', 'goal_segmentation'},
              'the backend has labels', 'none'),
@@ -507,6 +510,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             info['goal_segmentation'] = self.goal_segmentation[self._shown_goal]
         if 'oracle_action' in self.config.privileged:
             info['oracle_action'] = self.oracle_actions()
+        if 'oracle_regret' in self.config.privileged:
+            info['oracle_regret'] = self.backend.routes.regrets(self.backend.poses,
+                                                                self.goal_poses[self._goal])
         if 'goal_pose' in self.config.privileged:
             info['goal_pose'] = self._goal_pose()
         if {'overlap', 'explorer_action'} & set(self.config.privileged):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numba
@@ -26,15 +27,16 @@ FARTHEST, TURNED_MOST = 1.0, math.radians(30)  # m, rad
 NEAR, TURNED = 0.25, math.radians(15)  # m, rad
 GAP = 6  # layers between open ones that are open too: where a robot could not turn it is trapped
 STEP, TURN_STEP = 0.02, math.radians(2)  # a move is checked at this spacing [m, rad]
-# Where the floor ends a robot slides along its edge: off its course by the first of these angles
-# that leads on. The edge is that of what was recorded, seldom a wall.
+# Where the floor ends a robot stops, or slides along: off its course by the first of these angles
+# that leads on. The edge is that of what was recorded, perhaps a wall, perhaps not.
 ASIDE = tuple(math.radians(angle) for angle in (0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75))
 BORDER = 2  # cells around the floor
 # What an action costs on a shortest way: that ends well within the open states, or at their edge,
 # where the next one may be cut off, or in a contact.
 CLEAN, EDGE, CUT = 2, 3, 6
-COSTS_KEPT = 256  # of goals; half a megabyte each in a flat
-FAR = 1 << 29
+COSTS_KEPT = 1024  # of goals; a third of a megabyte each in a flat
+FAR = 2**16 - 1  # no way
+MOST = 5.0  # decisions: a worse action is as bad
 # Within these of the goal's pose a robot has surely arrived, wherever in its cell it is.
 SURE_RADIUS = ARRIVAL_RADIUS - 2 * CELL
 SURE_HEADING = ARRIVAL_HEADING - 2 * HEADING
@@ -84,18 +86,21 @@ class PoseMap:
         """Numbers of the states that poses [N,>=3] are in; -1: closed."""
         return _states(np.ascontiguousarray(poses[:, :3], float), *self.lattice)
 
-    def drive(self, poses: np.ndarray, deltas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def drive(self, poses: np.ndarray, deltas: np.ndarray, slides: np.ndarray | None = None
+              ) -> tuple[np.ndarray, np.ndarray]:
         """Move robots in their own frames, up to where the open poses end.
 
         Args:
             poses: [N,>=3]; deltas: [N,>=3] dx, dy [m], dyaw [rad]. A simultaneous turn bends the
                 translation to the mean heading, as in `world.World.move`.
+            slides: [N] bool: along the edge of the open poses, see `ASIDE`; None: none does.
 
         Returns:
             [N,3] where they are then, and [N] the share of each move that was done.
         """
         return _drive(np.ascontiguousarray(poses[:, :3], float),
-                      np.ascontiguousarray(deltas[:, :3], float), *self.lattice)
+                      np.ascontiguousarray(deltas[:, :3], float),
+                      np.zeros(len(poses), bool) if slides is None else slides, *self.lattice)
 
     @functools.cached_property
     def leads(self) -> tuple[np.ndarray, np.ndarray]:
@@ -117,7 +122,7 @@ class PoseMap:
         return number == np.argmax(np.bincount(number))
 
     def _costs(self, x: float, y: float, yaw: float) -> np.ndarray:
-        """[S] int32 cost of the shortest way to a goal pose; `FAR`: there is none."""
+        """[S] uint16 cost of the shortest way to a goal pose; `FAR`: there is none."""
         at = np.array(self.origin) + (self.cells[:, 1::-1] + 0.5) * CELL
         turn = np.abs((self.cells[:, 2] * HEADING - yaw + math.pi) % (2 * math.pi) - math.pi)
         there = (np.hypot(*(at - (x, y)).T) <= SURE_RADIUS) & (turn <= SURE_HEADING)
@@ -146,6 +151,22 @@ class PoseMap:
                 part = closed[i:i + rows, j:j + columns]
                 beside |= part | np.roll(part, 1, axis=2) | np.roll(part, -1, axis=2)
         return ~beside[tuple(self.cells.T)]
+
+    def regrets_to(self, poses: np.ndarray, goal_pose: Sequence[float]) -> np.ndarray:
+        """What each action costs more than the best one, [N,A] float32 in decisions.
+
+        The rest of the way to a goal is the shortest; at most `MOST`, also of what leads nowhere.
+
+        Args:
+            poses: [N,>=3].
+        """
+        return _regrets(np.ascontiguousarray(poses[:, :3], float), self.moves,
+                        self.costs(*map(float, goal_pose[:3])), self.inner, *self.lattice)
+
+    def regrets(self, poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
+        """As `regrets_to`, of poses [N,4] each towards a goal of its own, [N,4]."""
+        return np.concatenate([self.regrets_to(pose[None], goal)
+                               for pose, goal in zip(poses, goal_poses, strict=True)])
 
     def actions(self, poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
         """The first action [N] of the shortest way from poses [N,4] to goals [N,4]."""
@@ -247,7 +268,7 @@ def _states(poses, x, y, state):
 
 
 @numba.njit(cache=True)
-def _move(px, py, yaw, dx, dy, dyaw, x, y, state):
+def _move(px, py, yaw, dx, dy, dyaw, slides, x, y, state):
     """The pose where a move ends, and the share of it that is done until nothing is open."""
     heading = yaw + 0.5 * dyaw
     c, s = math.cos(heading), math.sin(heading)
@@ -262,7 +283,7 @@ def _move(px, py, yaw, dx, dy, dyaw, x, y, state):
             nx, ny = px + c * (c * mx - s * my), py + c * (s * mx + c * my)
             if _state(nx, ny, _wrap(yaw + turn), x, y, state) >= 0:
                 px, py, yaw, there = nx, ny, _wrap(yaw + turn), True
-            if there or still:
+            if there or still or not slides:
                 break
         if not there:
             return px, py, yaw, k / count
@@ -275,12 +296,12 @@ def _wrap(angle):
 
 
 @numba.njit(cache=True)
-def _drive(poses, deltas, x, y, state):
+def _drive(poses, deltas, slides, x, y, state):
     ends, share = np.empty((len(poses), 3)), np.empty(len(poses))
     for n in range(len(poses)):
         ends[n, 0], ends[n, 1], ends[n, 2], share[n] = _move(
-            poses[n, 0], poses[n, 1], poses[n, 2], deltas[n, 0], deltas[n, 1], deltas[n, 2], x, y,
-            state)
+            poses[n, 0], poses[n, 1], poses[n, 2], deltas[n, 0], deltas[n, 1], deltas[n, 2],
+            slides[n], x, y, state)
     return ends, share
 
 
@@ -292,7 +313,7 @@ def _leads(cells, moves, x, y, state):
         px, py = x + (cells[n, 1] + 0.5) * CELL, y + (cells[n, 0] + 0.5) * CELL
         for a in range(len(moves)):
             ex, ey, eyaw, share = _move(px, py, cells[n, 2] * HEADING, moves[a, 0], moves[a, 1],
-                                        moves[a, 2], x, y, state)
+                                        moves[a, 2], False, x, y, state)
             to[n, a] = _state(ex, ey, eyaw, x, y, state)
             cut[n, a] = share < 1.0
     return to, cut
@@ -356,7 +377,7 @@ def _components(to):
 @numba.njit(cache=True)
 def _spread(there, first, source, cost, count):
     """Costs of the ways to some states, by label correction over a queue."""
-    costs = np.full(count, FAR, np.int32)
+    costs = np.full(count, FAR, np.uint16)
     queue = np.empty(count + 1, np.int32)
     waiting = np.zeros(count, np.bool_)
     head, tail = 0, 0
@@ -370,7 +391,7 @@ def _spread(there, first, source, cost, count):
         head = (head + 1) % len(queue)
         waiting[state] = False
         for k in range(first[state], first[state + 1]):
-            before, value = source[k], costs[state] + cost[k]
+            before, value = source[k], np.int64(costs[state]) + cost[k]
             if value < costs[before]:
                 costs[before] = value
                 if not waiting[before]:
@@ -381,16 +402,30 @@ def _spread(there, first, source, cost, count):
 
 
 @numba.njit(cache=True)
-def _choose(pose, moves, costs, inner, x, y, state):
-    """The action that leads to the least cost; none that a contact ends at once, if there is."""
-    best, least = 0, 2.0 * FAR
+def _values(pose, moves, costs, inner, x, y, state, values):
+    """What the way costs by each first action; none that a contact ends at once, if there is."""
     for a in range(len(moves)):
         ex, ey, eyaw, share = _move(pose[0], pose[1], pose[2], moves[a, 0], moves[a, 1],
-                                    moves[a, 2], x, y, state)
+                                    moves[a, 2], False, x, y, state)
         end = _state(ex, ey, eyaw, x, y, state)
-        if end < 0 or share == 0.0:
-            continue
-        value = costs[end] + (CUT if share < 1.0 else CLEAN if inner[end] else EDGE)
-        if value < least:
-            best, least = a, value
-    return best
+        values[a] = 2.0 * FAR
+        if end >= 0 and share > 0.0:
+            values[a] = costs[end] + (CUT if share < 1.0 else CLEAN if inner[end] else EDGE)
+
+
+@numba.njit(cache=True)
+def _choose(pose, moves, costs, inner, x, y, state):
+    values = np.empty(len(moves))
+    _values(pose, moves, costs, inner, x, y, state, values)
+    return np.argmin(values)
+
+
+@numba.njit(cache=True)
+def _regrets(poses, moves, costs, inner, x, y, state):
+    found, values = np.empty((len(poses), len(moves)), np.float32), np.empty(len(moves))
+    for n in range(len(poses)):
+        _values(poses[n], moves, costs, inner, x, y, state, values)
+        least = values.min()
+        for a in range(len(moves)):
+            found[n, a] = min((values[a] - least) / CLEAN, MOST)
+    return found

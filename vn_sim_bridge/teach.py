@@ -12,12 +12,15 @@ from vn_nav.robot import RobotSpec
 from vn_sim_bridge.backends.image_graph import ImageGraphBackend
 from vn_sim_bridge.env import PRIVILEGED, EnvConfig, NavigationEnv
 from vn_sim_bridge.graph_pairs import GraphPairs
+from vn_sim_bridge.graph_views import GraphViews
 from vn_sim_bridge.houses.house import CELL
 from vn_sim_bridge.image_graph import MARGIN, ImageGraph, build_graph
 
-__all__ = ['MARGIN', 'build_graph', 'draw_map', 'held_out', 'make_env', 'make_pairs']
+__all__ = ['MARGIN', 'build_graph', 'draw_map', 'held_out', 'make_env', 'make_pairs', 'make_views',
+           'regrets']
 
 SHARE, LEAST = 10, 2  # one goal in so many is held out, and at least so many are
+STRETCH, STRETCHES = 10, 20  # one in so many stretches of so many pictures judges
 PIXELS = 8  # a cell of the floor, in the map
 BLOCKED, FLOOR, NODE, GOAL, OTHER = (  # colours, RGB
     (214, 216, 220), (250, 249, 245), (120, 128, 140), (42, 98, 201), (196, 87, 44))
@@ -35,7 +38,7 @@ def held_out(graph: ImageGraph) -> tuple[ImageGraph, ImageGraph | None]:
 
 
 def make_env(graph: ImageGraph, robot: RobotSpec, envs: int, *, privileged: tuple[str, ...] = (),
-             draw: bool = True, **options) -> NavigationEnv:
+             draw: bool = True, varied: bool = False, **options) -> NavigationEnv:
     """A `NavigationEnv` in a graph.
 
     Args:
@@ -43,14 +46,15 @@ def make_env(graph: ImageGraph, robot: RobotSpec, envs: int, *, privileged: tupl
         robot: with the policy's actions alone.
         envs: robots.
         privileged: outputs that are asked for; what any environment tells is none of them.
-        draw: see `ImageGraphBackend`.
+        draw, varied: see `ImageGraphBackend`.
         options: further fields of `EnvConfig`.
     """
     config = EnvConfig(
         num_envs=envs, size=graph.pictures.shape[-1], actions=robot.action_names,
         privileged=tuple(sorted(set(privileged) & set(PRIVILEGED))), **options)
     return NavigationEnv(config, robot,
-                         backend=ImageGraphBackend(graph, envs, robot=robot, draw=draw))
+                         backend=ImageGraphBackend(graph, envs, robot=robot, draw=draw,
+                                                   varied=varied))
 
 
 def make_pairs(own: ImageGraph, others: ImageGraph | None, robot: RobotSpec, seed: int
@@ -61,6 +65,24 @@ def make_pairs(own: ImageGraph, others: ImageGraph | None, robot: RobotSpec, see
         return GraphPairs(own, robot, rows, seed), GraphPairs(own, robot, rows, seed + 1)
     return (GraphPairs(own, robot, np.setdiff1d(rows, others.goal_nodes), seed),
             GraphPairs(own, robot, others.goal_nodes, seed + 1))
+
+
+def make_views(graph: ImageGraph, robot: RobotSpec, seed: int
+               ) -> tuple[GraphViews, GraphViews]:
+    """Pictures to know the place by, and others, stretches of the drive, to judge by."""
+    judged = np.arange(len(graph.poses)) // STRETCH % STRETCHES == STRETCHES // 2
+    return (GraphViews(graph, robot, np.flatnonzero(~judged), seed),
+            GraphViews(graph, robot, np.flatnonzero(judged), seed + 1))
+
+
+def regrets(graph: ImageGraph, poses: np.ndarray) -> np.ndarray:
+    """What each first action costs more than the best, see `PoseMap.regrets_to`.
+
+    Returns:
+        [G,N,A] float16, from poses [N,3] to each of the goals.
+    """
+    return np.stack([graph.map.regrets_to(poses, goal.pose).astype(np.float16)
+                     for goal in graph.goals])
 
 
 def draw_map(path: Path, own: ImageGraph, others: ImageGraph | None) -> None:

@@ -27,6 +27,7 @@ from vn_nav.policy.network import Latents, Policy
 MAX_DEPTH = 10.0  # m, white in the depth target
 FAR = 12.0  # m, beyond which distances count as this far
 POSE_OVERLAP = 0.1  # share of the goal picture that must be in view for its pose to count
+WARMTH = 0.5  # decisions: an action that loses so much is a third as likely to be imitated
 CLASS_COUNT = 64  # colours; label ids are below
 
 
@@ -164,11 +165,21 @@ def imitation_loss(network: Policy, latents: Latents, rollout: Rollout, key: str
     have seen (`vn_sim_bridge.explorer`), or, in a house known by heart, the shortest path. `key`
     names its actions among the privileged. Weighted down to nothing in the course of a training,
     so that reinforcement has the last word (Ross et al. 2011; Schmitt et al., arXiv 1803.03835).
+    Of what each action loses, [T,B,A] float, it is the cross-entropy with `softened` choices.
     """
-    logits = network.actor(latents.hidden[:len(rollout.valid)])
-    action = _privileged(rollout, key)[:len(rollout.valid)]
-    loss = F.cross_entropy(logits.flatten(0, 1), action.flatten(), reduction='none')
+    logits = network.read(latents).logits[:len(rollout.valid)]
+    told = _privileged(rollout, key)[:len(rollout.valid)]
+    wanted = softened(told.flatten(0, 1)) if told.is_floating_point() else told.flatten()
+    loss = F.cross_entropy(logits.flatten(0, 1), wanted, reduction='none')
     return masked_mean(loss, rollout.valid.flatten())
+
+
+def softened(regrets: Tensor) -> Tensor:
+    """Probabilities [N,A] of actions, the likelier the less they lose [decisions].
+
+    The one best action jumps from pose to pose where two are about as good, and cannot be learned.
+    """
+    return torch.softmax(-regrets / WARMTH, dim=-1)
 
 
 def _privileged(rollout: Rollout, key: str) -> Tensor:

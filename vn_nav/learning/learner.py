@@ -33,7 +33,9 @@ HEADLESS = ('value_replay', 'imitation')  # they learn through critic and actor
 PRIVILEGED = {'depth': ('depth',), 'segmentation': ('segmentation',),
               'goal_segmentation': ('goal_segmentation',), 'goal_pose': ('goal_pose', 'overlap'),
               'arrival': ('arrived',), 'distance': ('distance',)}
-TEACHERS = ('explorer', 'oracle')
+# What each teacher tells, and the action by which it drives.
+TEACHERS = {'explorer': ('explorer_action',), 'oracle': ('oracle_action',),
+            'routes': ('oracle_action', 'oracle_regret')}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +75,8 @@ class LearnerConfig:
     teacher_until: float = 0.5  # share of the training at which it has fallen to 0
     imitation_until: float = 0.7  # share of the training at which it has fallen to 0
     # Whom to imitate: one that knows what the robot has seen, or the shortest path, which only a
-    # policy that knows the house by heart can follow.
+    # policy that knows the house by heart can follow: its actions, or (routes) what each action
+    # loses, where the simulator knows that.
     teacher: str = 'explorer'
     # The replay memory, used by `REPLAY_TASKS`, and by the image heads if `images_from_replay`.
     images_from_replay: bool = True
@@ -126,7 +129,7 @@ class LearnerConfig:
     def privileged(self) -> tuple[str, ...]:
         """What batches must hold beside the observations."""
         keys = [key for name in self.tasks for key in PRIVILEGED.get(name, ())]
-        return tuple(keys) + ((f'{self.teacher}_action',) if self.imitation else ())
+        return tuple(keys) + (TEACHERS[self.teacher] if self.imitation else ())
 
     @property
     def from_replay(self) -> tuple[str, ...]:
@@ -302,7 +305,7 @@ class Learner:
             return auxiliary.goal_pose_loss(latents, batch)
         if name == 'imitation':
             return auxiliary.imitation_loss(self.network, latents, batch,
-                                            f'{self.config.teacher}_action')
+                                            TEACHERS[self.config.teacher][-1])
         loss = {'arrival': auxiliary.arrival_loss, 'distance': auxiliary.distance_loss}[name]
         return loss(self.network, latents, batch)
 

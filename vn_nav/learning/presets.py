@@ -44,6 +44,7 @@ class TrainConfig(LearnerConfig):
     stacked_frames: int = 1
     deconvolutions: int | None = None  # None: one below `LARGE` pixels, else two (table 5.1)
     pose_to_memory: bool = False
+    places: int = 0  # spots of a place that `vn_nav teach` has taught
     track_goal: bool = False  # by dead reckoning, see `vn_nav.policy.memory.GoalTracker`
     # Of icra2017: the file with the weights of ResNet-50 (without one: the small random encoder),
     # and the scenes with layers of their own (house i of the environment is scene i).
@@ -130,8 +131,8 @@ class TrainConfig(LearnerConfig):
             actions=actions, size=size, architecture=self.architecture, channels=self.channels,
             blocks=self.blocks, features=self.features, hidden=self.hidden,
             frames=self.stacked_frames, heads=tuple(heads), deconvolutions=deconvolutions,
-            pose_to_memory=self.pose_to_memory, moves=moves if self.track_goal else (),
-            pixel_mean=self.pixel_mean,
+            pose_to_memory=self.pose_to_memory, places=self.places,
+            moves=moves if self.track_goal else (), pixel_mean=self.pixel_mean,
             pixel_std=self.pixel_std, frozen='resnet50' if self.frozen_weights else '',
             scenes=self.scenes)
 

@@ -116,8 +116,9 @@ class Objective:
             steps = windows.valid
             rows, goals = windows.rows[steps], np.broadcast_to(windows.goal, steps.shape)[steps]
             own = self._tensor(steps.reshape(-1))
-            losses |= self._memory_losses(latents.hidden.flatten(0, 1)[own], windows, rows, goals,
-                                          tally)
+            losses |= self._memory_losses(
+                latents.hidden.flatten(0, 1)[own],
+                self.network.read(latents).logits.flatten(0, 1)[own], windows, rows, goals, tally)
             if latents.pose is not None:
                 poses.append((Pose(*(part[own] for part in latents.pose)), rows, goals))
         if 'goal_pose' in self.parts and poses:
@@ -162,14 +163,13 @@ class Objective:
         tally.add(name, loss, count)
         return loss
 
-    def _memory_losses(self, hidden: Tensor, windows: Windows, rows: np.ndarray,
+    def _memory_losses(self, hidden: Tensor, logits: Tensor, windows: Windows, rows: np.ndarray,
                        goals: np.ndarray, tally: Tally) -> dict[str, Tensor]:
-        """Losses of what is read from the memory's outputs [K,H] at the valid steps."""
+        """Losses of what memory [K,H] and actor [K,A] say at the valid steps."""
         network, losses = self.network, {}
         if 'cloning' in self.parts:
             acts, action = (self._tensor(part[windows.valid])
                             for part in (windows.acts, windows.action))
-            logits = network.actor(hidden)
             losses['cloning'] = masked_mean(
                 F.cross_entropy(logits, action, reduction='none'), acts)
             tally.add('cloning', losses['cloning'], int(acts.sum()))

@@ -12,10 +12,12 @@ import json
 import math
 import shlex
 import sys
+import time
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
 from vn_nav.bags.drive import Topics, load_topics
@@ -25,9 +27,10 @@ from vn_nav.evaluation import evaluator, tables
 from vn_nav.evaluation.evaluation_page import evaluation_page
 from vn_nav.learning.command import CHANGES, train_config
 from vn_nav.learning.pairs import PairSource
+from vn_nav.learning.places import BANK, Views, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.pretrain_command import RECORDED, scene_of
-from vn_nav.learning.trainer import STATE, train
+from vn_nav.learning.trainer import STATE, has_fast_bfloat16, train
 from vn_nav.policy.checkpoint import (
     LoadedCheckpoint,
     load_checkpoint,
@@ -39,12 +42,15 @@ from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
 
 PRESET = 'fast'
 # The place is one to know by heart: there the shortest path is something to imitate.
-TEACHER = {'imitation': 1.0, 'imitation_until': 1.0, 'teacher': 'oracle', 'teacher_share': 0.5,
+TEACHER = {'imitation': 1.0, 'imitation_until': 1.0, 'teacher': 'routes', 'teacher_share': 0.5,
            'teacher_until': 0.6, 'start_difficulty': 1.0}
 # Without a checkpoint: much is learned from each rollout, and first from picture pairs, for so
 # large a share of the minutes.
 FROM_NOTHING = {'epochs': 4, 'minibatches': 8, 'learning_rate': 1e-3}
 PAIR_SHARE = 0.1
+PLACES = 64  # spots that the policy tells apart
+PLACE_SHARE, ROUTE_SHARE = 0.07, 0.1  # of the minutes, to learn them, and the ways between
+START = 'start'  # folder of the policy that knows the place, but no way there
 COLLISION_REWARD = -0.05  # of leaving what the pictures cover
 LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by
 CONTROLS = (evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST)
@@ -71,6 +77,12 @@ class Place(Protocol):
                    ) -> tuple[PairSource, PairSource]:
         """Picture pairs to learn from, and to judge by."""
 
+    def make_views(self, graph, robot: RobotSpec, seed: int) -> tuple[Views, Views]:
+        """Pictures with poses to know the place by, and others to judge by."""
+
+    def regrets(self, graph, poses: np.ndarray) -> np.ndarray:
+        """[G,N,A] float16 decisions that actions at poses [N,3] lose on the ways to the goals."""
+
     def draw_map(self, path: Path, own, others) -> None:
         """A picture of the place."""
 
@@ -88,10 +100,12 @@ def add_teach_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
     parser.add_argument('--margin', type=float, metavar='M',
                         help='beside the driven path that counts as free [m]; default 0.3')
-    parser.add_argument('--straighten', action='store_true', help='correct odometry by the places '
-                        'that the drive shows twice, for odometry that drifts by more than that '
-                        'does (docs/bags.md)')
-    parser.add_argument('--goals', type=int, default=96, help='pictures to drive to, at most')
+    parser.add_argument('--straighten', action=argparse.BooleanOptionalAction, default=True,
+                        help='correct odometry by the places that the drive shows twice '
+                        '(docs/bags.md)')
+    parser.add_argument('--goals', type=int, default=1000, help='pictures to drive to, at most')
+    parser.add_argument('--places', type=int, default=PLACES, metavar='K', help='spots of the '
+                        'place that the policy knows by heart; 0: none')
     parser.add_argument('--episodes', type=int, default=50, help='of each row of the evaluation')
     parser.add_argument('--size', type=int, help='without a checkpoint: side of the pictures '
                         '[pixels]; default 84')
@@ -127,9 +141,13 @@ def teach(args: argparse.Namespace, place: Place) -> int:
     place.draw_map(args.out / 'map.png', own, others)
     world = ENVIRONMENT[PRESET] | {'collision_reward': COLLISION_REWARD}
     env = place.make_env(own, robot, args.envs, seed=args.seed, privileged=config.privileged,
+                         varied=True,
                          **{name: value for name, value in world.items() if name != 'envs'})
+    init = args.checkpoint
+    if args.places and not (args.resume and (args.out / STATE).is_file()):
+        init = _learn_places(args, place, own, robot, given, config)
     folder = train(env, config, args.out, info=_info(args, robot, graph), resume=args.resume,
-                   init=args.checkpoint,
+                   init=init,
                    pairs=lambda: place.make_pairs(own, others, robot, args.seed))
     _evaluate(args, place, folder, given, robot, dict(zip(SPLITS, (own, others), strict=True)))
     print(folder)
@@ -141,6 +159,8 @@ def _check(args: argparse.Namespace) -> None:
         (args.minutes > 0, 'there is some time to learn', args.minutes, 'raise --minutes'),
         (args.goals >= 4, 'there are at least four goals', args.goals, 'raise --goals'),
         (args.episodes >= 1, 'there is at least one episode', args.episodes, 'raise --episodes'),
+        (args.places == 0 or 2 <= args.places <= 1024, 'there are 2 to 1024 spots, or none',
+         args.places, 'correct --places'),
         (args.envs >= 1, 'there is at least one robot', args.envs, 'raise --envs'),
         (args.size is None or args.checkpoint is None, 'the size is that of the checkpoint',
          args.size, 'leave out --size'),
@@ -154,7 +174,8 @@ def _check(args: argparse.Namespace) -> None:
 
 def _config(args: argparse.Namespace, given: LoadedCheckpoint | None) -> TrainConfig:
     """The preset's numbers, for the network of a checkpoint if there is one."""
-    own = {'frames': 10**9, 'minutes': args.minutes, **TEACHER}
+    left = args.minutes * (1 - (PLACE_SHARE + ROUTE_SHARE if args.places else 0))
+    own = {'frames': 10**9, 'minutes': left, 'places': args.places, **TEACHER}
     if given is None:
         own |= FROM_NOTHING | {'pair_minutes': PAIR_SHARE * args.minutes}
     else:
@@ -205,7 +226,7 @@ def _graph(args: argparse.Namespace, place: Place, robot: RobotSpec, size: int):
 
 def _poses(args: argparse.Namespace, drives: DriveSet, robot: RobotSpec, topics: Topics,
            cache: Path) -> np.ndarray:
-    """Where the pictures were taken, [N,3]: by odometry, straightened if that is asked for.
+    """Where the pictures were taken, [N,3]: by odometry, straightened unless that is not wanted.
 
     Larger pictures than the network's tell more exactly.
     """
@@ -223,6 +244,45 @@ def _poses(args: argparse.Namespace, drives: DriveSet, robot: RobotSpec, topics:
     else:
         print('odometry stays as it is: too few places are recognised when seen again', flush=True)
     return found.poses
+
+
+def _learn_places(args: argparse.Namespace, place: Place, graph, robot: RobotSpec,
+                  given: LoadedCheckpoint | None, config: TrainConfig) -> Path:
+    """Know the place by its pictures; the policy to go on with."""
+    torch.set_num_threads(config.threads)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(args.seed)
+        network = Policy(config.network(robot.action_names, graph.pictures.shape[-1],
+                                        robot.moves if config.track_goal else ()))
+    if given is not None:
+        network.load_state_dict(_widened(given.network.state_dict(), network))
+    network.compute_dtype = torch.bfloat16 if has_fast_bfloat16() else torch.float32
+    def say(words: str) -> None:
+        print(words, flush=True)
+    views, others = place.make_views(graph, robot, args.seed)
+    facts = fit_places(network, views, others, graph.poses[:, :2],
+                       minutes=PLACE_SHARE * args.minutes, say=say)
+    until = time.monotonic() + 60 * ROUTE_SHARE * args.minutes
+    pictures, poses = views.draw(BANK)
+    facts |= fit_routes(network, pictures, graph.pictures[list(graph.goal_nodes)],
+                        place.regrets(graph, poses), until=until, say=say, seed=args.seed)
+    save_checkpoint(args.out / START, network, {
+        **_info(args, robot, graph), 'frames': 0, 'seed': args.seed,
+        'minutes': (PLACE_SHARE + ROUTE_SHARE) * args.minutes, 'results': {'places': facts}})
+    return args.out / START
+
+
+def _widened(given: dict[str, torch.Tensor], network: Policy) -> dict[str, torch.Tensor]:
+    """Weights of a policy, for one whose memory is told of places as well: not yet listened to."""
+    own = network.state_dict()
+    for name, tensor in own.items():
+        if name not in given or name.startswith(('places.', 'routes.')):  # of another place
+            given[name] = tensor
+        elif given[name].shape != tensor.shape:  # the inputs of the memory
+            wide = torch.zeros_like(tensor)
+            wide[:, :given[name].shape[1]] = given[name]
+            given[name] = wide
+    return {name: given[name] for name in own}
 
 
 def _info(args: argparse.Namespace, robot: RobotSpec, graph) -> dict:
@@ -271,7 +331,7 @@ def _evaluate(args: argparse.Namespace, place: Place, folder: Path,
 def _measure(args: argparse.Namespace, place: Place, graph, robot: RobotSpec, network: Policy,
              controls, threshold: float) -> evaluator.Rows:
     def make(_, envs: int, stop: str):
-        return place.make_env(graph, robot, envs, stop=stop,
+        return place.make_env(graph, robot, envs, stop=stop, varied=True,
                               max_decisions=ENVIRONMENT[PRESET]['max_decisions'])
     return evaluator.measure(make, network, [graph.seed], decoding='sample',
                              episodes=args.episodes, controls=controls, threshold=threshold,

@@ -21,7 +21,7 @@ from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.learning.bag_mix import BagMix
 from vn_nav.learning.curriculum import Curriculum, FrameCurriculum
 from vn_nav.learning.distributed import Processes
-from vn_nav.learning.learner import BASIC_LOSSES, TASKS, Learner
+from vn_nav.learning.learner import BASIC_LOSSES, TASKS, TEACHERS, Learner
 from vn_nav.learning.log import Log
 from vn_nav.learning.pairs import PairConfig, PairSource, pretrain_pairs
 from vn_nav.learning.presets import TrainConfig
@@ -276,7 +276,7 @@ class Training:
         config = self.config
         share = config.teacher_share * max(1 - self.progress / config.teacher_until, 0.0)
         return self.collector.collect(
-            config.rollout_length, f'{config.teacher}_action' if config.teacher_share else None,
+            config.rollout_length, TEACHERS[config.teacher][0] if config.teacher_share else None,
             share)
 
     def update(self) -> dict:

@@ -162,7 +162,7 @@ class ResidualBlock(nn.Module):
         return F.relu(x + apply(self.conv2, F.relu(apply(self.conv1, x))))
 
 
-def _directions(maps: Tensor) -> Tensor:
+def directions(maps: Tensor) -> Tensor:
     """Maps [N,C,h,w] of length 1 along C; the lengths in float32, for bfloat16 is too coarse."""
     return F.normalize(maps.float(), dim=1).to(maps.dtype)
 
@@ -209,7 +209,7 @@ class Matching(nn.Module):
 
     def encode_goals(self, goals: Tensor, dtype: torch.dtype) -> Tensor:
         """What places of the goals look like, [G,C,h,w] of length 1 along C."""
-        return _directions(apply(self.key, self.see(goals, dtype)))
+        return directions(apply(self.key, self.see(goals, dtype)))
 
     def forward(self, image: Tensor, goal_maps: Tensor, goal_index: Tensor | None,
                 dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -221,7 +221,7 @@ class Matching(nn.Module):
         """Maps and features, as `forward`, of what `see` returned."""
         if goal_index is not None:
             goal_maps = goal_maps.index_select(0, goal_index)
-        query = _directions(apply(self.query, seen))
+        query = directions(apply(self.query, seen))
         # [N,places,C] x [N,C,places of the goal]: the maps lie in memory as the left one.
         volume = self.SCALE * torch.bmm(
             query.permute(0, 2, 3, 1).flatten(1, 2), goal_maps.flatten(2))

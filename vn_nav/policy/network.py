@@ -31,6 +31,7 @@ from vn_nav.policy.memory import (
     RecurrentState,
     stack_frames,
 )
+from vn_nav.policy.places import WIDTH, PlaceRecogniser, Routes
 from vn_nav.policy.zhu import FROZEN, SceneLinear, Siamese
 
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
@@ -62,6 +63,9 @@ class NetworkConfig:
     # [A,3] dx, dy [m], dyaw [rad] of the actions: with them the memory also sees where the goal
     # stands by dead reckoning since it was seen, see `GoalTracker`. Empty: it does not.
     moves: tuple[tuple[float, float, float], ...] = ()
+    # Spots of one place that the policy knows by heart; more than none: the memory also sees where
+    # there picture and goal were taken, see `vn_nav.policy.places`.
+    places: int = 0
     # Grey levels. Standardised input is what made learning work; whole numbers up to 256 less a
     # whole mean stay exact in bfloat16.
     pixel_mean: float = 120.0
@@ -98,6 +102,9 @@ class NetworkConfig:
             (not self.moves or (len(self.moves) == len(self.actions)
                                 and all(len(move) == 3 for move in self.moves)),
              'there is a move (dx, dy, dyaw) for each action', self.moves),
+            (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
+                                  and self.architecture != 'icra2017'),
+             'a policy with an LSTM knows none, or 2 to 1024 spots of a place', self.places),
             (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
             (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
              'one', self.frozen),
@@ -129,6 +136,7 @@ class Latents(NamedTuple):
     hidden: Tensor  # [T,B,H] float32 outputs of the memory
     pose: Pose | None  # [T*B,...], if the network has the head goal_pose
     scene: Tensor | None = None  # [T,B] int64, of icra2017
+    advice: Tensor | None = None  # [T,B,A] logits, of a policy that knows the place
 
 
 class Policy(nn.Module):
@@ -159,13 +167,23 @@ class Policy(nn.Module):
             self.encoder = encoder(config.size, **pixels)
         inputs = (self.encoder.features + len(config.actions) + 1
                   + (5 if config.pose_to_memory else 0)
-                  + (GoalTracker.WIDTH if config.moves else 0))
+                  + (GoalTracker.WIDTH if config.moves else 0)
+                  + (WIDTH if config.places else 0))
         self.tracker = GoalTracker(config.moves) if config.moves else None
         thesis = own is None
         if config.frames > 1:
             self.memory = Feedforward(inputs, config.hidden)
         else:
             self.memory = MaskedLSTM(inputs, config.hidden, thesis=thesis)
+        self.places = self.routes = None
+        if config.places:
+            self.places = PlaceRecogniser(config.size, config.places, config.pixel_mean,
+                                          config.pixel_std)
+            self.routes = Routes(self.places.width, len(config.actions))
+            with torch.no_grad():
+                self._goal_shape = self.encoder.encode_goals(
+                    torch.zeros(1, 3, config.size, config.size, dtype=torch.uint8),
+                    torch.float32).shape[1:]
         self.actor = nn.Linear(config.hidden, len(config.actions))
         self.critic = nn.Linear(config.hidden, 1)
         self._initialise(thesis)
@@ -178,6 +196,7 @@ class Policy(nn.Module):
     def _build_scenes(self) -> None:
         """The parts of icra2017, see `vn_nav.policy.zhu`."""
         config, width = self.config, self.config.hidden
+        self.places = None
         self.encoder = Siamese(config.frozen, config.frames, width)
         self.memory = SceneLinear(width, width, config.scenes)
         self.actor = SceneLinear(width, len(config.actions), config.scenes)
@@ -240,10 +259,17 @@ class Policy(nn.Module):
         return self.encoder.look(pictures)
 
     def encode_goals(self, goals: Tensor) -> Tensor:
-        """What the encoder keeps of goals [G,3,S,S] uint8; see `vn_nav.policy.encoders`."""
+        """What the encoder keeps of goals [G,3,S,S] uint8; see `vn_nav.policy.encoders`.
+
+        A policy that knows a place keeps [G,...+K+16]: where they were taken, behind the rest.
+        """
         if self.config.frames > 1 and not self.frozen:
             goals = goals.repeat(1, self.config.frames, 1, 1)
-        return self.encoder.encode_goals(goals, self.compute_dtype)
+        maps = self.encoder.encode_goals(goals, self.compute_dtype)
+        if self.places is None:
+            return maps
+        return torch.cat([maps.flatten(1), self.places(goals, self.compute_dtype).to(maps.dtype)],
+                         dim=1)
 
     def encode(self, image: Tensor, goal_maps: Tensor, goal_index: Tensor | None
                ) -> tuple[Tensor, Tensor]:
@@ -272,6 +298,9 @@ class Policy(nn.Module):
             if self.config.frames > 1:  # no pictures before: the first one stands for them
                 starts = starts.clone()
                 starts[0] = True
+        if goal_maps is None:
+            goal_maps = self.encode_goals(obs.goals)
+        goal_maps, goal_places = self._parts(goal_maps)
         maps, features, state = self._look(obs, starts, state, goal_maps)
         if self.frozen:
             scene = self._scene(obs)
@@ -283,7 +312,7 @@ class Policy(nn.Module):
         inputs = [features.view(steps, batch, -1),
                   (obs.last_action.unsqueeze(-1) == actions).to(dtype),
                   obs.last_reward.clamp(-1.0, 1.0).unsqueeze(-1).to(dtype)]
-        pose = None
+        pose = advice = None
         if 'goal_pose' in self.heads:
             pose = self.heads['goal_pose'](features)
             if self.config.pose_to_memory:
@@ -294,12 +323,20 @@ class Policy(nn.Module):
                 *(part.detach().view(steps, batch, *part.shape[1:]) for part in pose),
                 obs.last_action, starts, state.hidden[:, own:])
             inputs.append(seen.to(dtype))
+        if self.places is not None:
+            if obs.goal_index is not None:
+                goal_places = goal_places[obs.goal_index.flatten()]
+            here = self.places(obs.image.flatten(0, 1), self.compute_dtype).to(dtype)
+            told, advice = self.routes(here, goal_places)
+            inputs.append(told.view(steps, batch, -1))
+            advice = advice.view(steps, batch, -1)
+        if self.tracker is not None:
             hidden, state = self.memory(torch.cat(inputs, dim=-1), starts,
                                         RecurrentState(state.hidden[:, :own], state.cell))
             state = RecurrentState(torch.cat([state.hidden, estimate], dim=1), state.cell)
         else:
             hidden, state = self.memory(torch.cat(inputs, dim=-1), starts, state)
-        return Latents(maps, features, hidden, pose), state
+        return Latents(maps, features, hidden, pose, advice=advice), state
 
     def maps(self, obs: Observation, starts: Tensor | None = None) -> Tensor:
         """The encoder's last maps [T*B,C,h,w].
@@ -309,12 +346,18 @@ class Policy(nn.Module):
         if starts is None:
             starts = torch.zeros_like(obs.last_action, dtype=torch.bool)
             starts[0] = True
-        return self._look(obs, starts, self.initial_state(starts.shape[1]), None)[0]
+        goal_maps, _ = self._parts(self.encode_goals(obs.goals))
+        return self._look(obs, starts, self.initial_state(starts.shape[1]), goal_maps)[0]
+
+    def _parts(self, goal_maps: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the encoder keeps of goals, and where they were taken, out of `encode_goals`."""
+        if self.places is None:
+            return goal_maps, None
+        width = self.places.width
+        return goal_maps[:, :-width].unflatten(1, self._goal_shape), goal_maps[:, -width:]
 
     def _look(self, obs: Observation, starts: Tensor, state: RecurrentState,
-              goal_maps: Tensor | None) -> tuple[Tensor, Tensor, RecurrentState]:
-        if goal_maps is None:
-            goal_maps = self.encode_goals(obs.goals)
+              goal_maps: Tensor) -> tuple[Tensor, Tensor, RecurrentState]:
         frames = obs.image
         if self.frozen:
             known = (obs.extras or {}).get('features')
@@ -344,7 +387,10 @@ class Policy(nn.Module):
             return PolicyOutput(self.actor(hidden, latents.scene),
                                 self.critic(hidden, latents.scene).squeeze(-1))
         arrival = self.heads['arrival'](hidden) if 'arrival' in self.heads else None
-        return PolicyOutput(self.actor(hidden), self.critic(hidden).squeeze(-1), arrival)
+        logits = self.actor(hidden)
+        if latents.advice is not None:
+            logits = logits + latents.advice
+        return PolicyOutput(logits, self.critic(hidden).squeeze(-1), arrival)
 
     def forward(self, obs: Observation, starts: Tensor, state: RecurrentState | None = None,
                 goal_maps: Tensor | None = None) -> tuple[PolicyOutput, RecurrentState]:

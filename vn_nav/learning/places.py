@@ -1,0 +1,178 @@
+"""A place by heart, before the policy learns there: where pictures were taken, and the ways."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vn_nav.arrival import wrap_angle
+from vn_nav.learning.auxiliary import softened
+from vn_nav.policy.network import Policy
+from vn_nav.policy.places import heading_cells
+
+BATCH = 128  # pictures
+LEARNING_RATE = 1e-3  # of Adam, at the start; falls to a twentieth
+NEAR, TURNED = 0.35, np.radians(20)  # m, rad: a spot and a heading stand for poses about so near
+JUDGED, JUDGED_GOALS = 1024, 32  # pictures
+BANK, ROUTE_BATCH = 8192, 1024  # pictures that ways begin at; ways in a step
+SEED = 1  # of the spots
+
+
+class Views(Protocol):
+    """Pictures of a place with their poses; `vn_sim_bridge.graph_views.GraphViews` is one."""
+
+    def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The next pictures [K,3,S,S] uint8 and poses [K,3] x, y [m], yaw [rad]."""
+
+
+def spread_spots(positions: np.ndarray, count: int) -> np.ndarray:
+    """[K,2] the middles of K parts that positions [N,2] fall into (k-means)."""
+    cv2.setRNGSeed(SEED)
+    enough = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    _, _, spots = cv2.kmeans(positions.astype(np.float32), count, None, enough, 3,
+                             cv2.KMEANS_PP_CENTERS)
+    return spots
+
+
+def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarray, *,
+               minutes: float, say: Callable[[str], None], least: int = 0) -> dict[str, float]:
+    """Fit the recogniser of a network to a place.
+
+    Cross-entropy with the spots and headings about the true pose (Banino et al. 2018).
+
+    Args:
+        network: with `places`, new ones; only they change.
+        source: views to learn from.
+        judge: views of other pictures of the place.
+        positions: [N,2] m, of all pictures: the spots are spread over them.
+        minutes: wall-clock time.
+        say: is told how it goes, a few times.
+        least: pictures to learn from, however long that takes.
+
+    Returns:
+        Medians on the other pictures: `metres` and `degrees` off, and `pictures` learned from.
+    """
+    places, dtype = network.places, network.compute_dtype
+    places.spots.copy_(torch.from_numpy(spread_spots(positions, len(places.spots))))
+    learned = places.see_as(network.encoder)
+    for layer in learned:
+        layer.requires_grad_(True)
+    optimiser = torch.optim.Adam([part for layer in learned for part in layer.parameters()],
+                                 LEARNING_RATE)
+    begun, seen, told = time.monotonic(), 0, 0
+    try:
+        while (share := _share((time.monotonic() - begun) / (60 * minutes), seen, least)) < 1:
+            for group in optimiser.param_groups:
+                group['lr'] = LEARNING_RATE * (1 - 0.95 * share)
+            pictures, poses = source.draw(BATCH)
+            scores = places.scores(torch.from_numpy(pictures), dtype)
+            loss = -sum((wanted * score).sum(1).mean() for wanted, score in zip(
+                _targets(places.spots, torch.from_numpy(poses)), scores, strict=True))
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            optimiser.step()
+            seen += BATCH
+            if share >= (told + 1) / 3:
+                told += 1
+                say(_words(seen, *errors(network, judge)))
+    finally:
+        places.requires_grad_(False)
+    metres, degrees = errors(network, judge)
+    say(_words(seen, metres, degrees))
+    return {'metres': metres, 'degrees': degrees, 'pictures': seen}
+
+
+def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets: np.ndarray, *,
+               until: float, say: Callable[[str], None], seed: int = 0, least: int = 1
+               ) -> dict[str, float]:
+    """Teach `Routes` the shortest ways, by what the recogniser says of pictures.
+
+    Cross-entropy with `softened` choices. Each picture is recognised once, and a hundred thousand
+    ways a second are learned from.
+
+    Args:
+        network: with `places` that are fitted; only `routes` change.
+        pictures: [N,3,S,S] uint8 where ways begin; goals: [G,3,S,S] where they end.
+        regrets: [G,N,A] decisions that each first action loses.
+        until: `time.monotonic()` at which to end.
+        say: is told how it went.
+        least: ways to learn from, however long that takes.
+
+    Returns:
+        `regret`: decisions that the most advised first action loses on average; `ways`: how many
+        were learned from.
+    """
+    here, there = recognise(network, pictures), recognise(network, goals)
+    labels, routes = torch.from_numpy(regrets), network.routes
+    generator = torch.Generator().manual_seed(seed)
+    optimiser = torch.optim.Adam(routes.parameters(), LEARNING_RATE)
+    begun, seen = time.monotonic(), 0
+    limit = max(until - begun, 1e-9)
+    while (share := _share((time.monotonic() - begun) / limit, seen, least)) < 1:
+        for group in optimiser.param_groups:
+            group['lr'] = LEARNING_RATE * (1 - 0.95 * share)
+        goal, row = (torch.randint(size, (ROUTE_BATCH,), generator=generator)
+                     for size in labels.shape[:2])
+        loss = F.cross_entropy(routes(here[row], there[goal])[1],
+                               softened(labels[goal, row].float()))
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        seen += ROUTE_BATCH
+    some = torch.randperm(len(labels), generator=generator)[:JUDGED_GOALS]
+    lost = _regret(network, here, there[some], labels[some])
+    say(f'ways: {seen:,} · the advised action loses {lost:.2f} decisions on average')
+    return {'regret': lost, 'ways': seen}
+
+
+def _share(time_share: float, seen: int, least: int) -> float:
+    """How much of the learning is over."""
+    return min(time_share, seen / least) if least else time_share
+
+
+@torch.no_grad()
+def recognise(network: Policy, pictures: np.ndarray) -> Tensor:
+    """What the recogniser says of pictures [N,3,S,S], [N,K+16]."""
+    return torch.cat([network.places(part, network.compute_dtype)
+                      for part in torch.from_numpy(pictures).split(BATCH)])
+
+
+@torch.no_grad()
+def _regret(network: Policy, here: Tensor, there: Tensor, labels: Tensor) -> float:
+    rows = torch.arange(len(here))
+    return float(np.mean([
+        float(own[rows, network.routes(here, goal.expand(len(here), -1))[1].argmax(1)].float()
+              .mean()) for goal, own in zip(there, labels, strict=True)]))
+
+
+@torch.no_grad()
+def errors(network: Policy, views: Views) -> tuple[float, float]:
+    """Medians of how far off the mean pose is [m], [deg]."""
+    pictures, poses = views.draw(JUDGED)
+    found = network.places.pose(recognise(network, pictures)).numpy()
+    off = np.hypot(*(found[:, :2] - poses[:, :2]).T)
+    turned = np.abs(wrap_angle(found[:, 2] - poses[:, 2]))
+    return float(np.median(off)), float(np.degrees(np.median(turned)))
+
+
+def _targets(spots: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """What the recogniser should say of poses [N,3]: [N,K] and [N,16]."""
+    gap = torch.cdist(poses[:, :2].float(), spots)
+    turn = poses[:, 2:].float() - heading_cells()
+    turn = torch.atan2(torch.sin(turn), torch.cos(turn))
+    return (torch.softmax(-0.5 * (gap / NEAR)**2, dim=1),
+            torch.softmax(-0.5 * (turn / TURNED)**2, dim=1))
+
+
+def _words(seen: int, metres: float, degrees: float) -> str:
+    return (f'places: {seen:,} pictures · on others: {metres:.2f} m, {degrees:.0f} deg off '
+            '(medians)')
+
+
