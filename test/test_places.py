@@ -183,7 +183,7 @@ def test_light_is_a_function_of_the_counter_and_changes_every_pixel_alike():
 
 def test_every_episode_in_a_graph_has_a_light_and_goals_have_none(corridor):  # noqa: F811
     robots = np.arange(2)
-    lit = ImageGraphBackend(corridor, 2, robot=ROBOT, varied=True, draw=False)
+    lit = ImageGraphBackend(corridor, 2, robot=ROBOT, light=True, draw=False)
     plain = ImageGraphBackend(corridor, 2, robot=ROBOT, draw=False)
     poses = np.array([[*corridor.poses[k], 0.0] for k in (5, 9)])
     for backend in (lit, plain):

@@ -25,6 +25,7 @@ from vn_nav.bags.recorder import BagWriter
 from vn_nav.cli import main
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import preset
+from vn_nav.learning.teach import OWN
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -189,6 +190,24 @@ def test_a_minute_in_the_pictures_of_a_drive_beats_chance(tmp_path):
     assert math.isclose(loaded.info['camera_fov_deg'], 90)
     with pytest.raises(UserError, match='a folder of its own'):
         raise_of(bag, out)
+
+
+@pytest.mark.slow  # the evaluation
+def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, capsys):
+    """Spots and ways alone: nothing that it has learned elsewhere changes but how it counts."""
+    bag, out = write_bag(tmp_path / 'bag', *driven), tmp_path / 'out'
+    given = load_checkpoint('models/anywhere')
+    assert main(['teach', str(bag), '--out', str(out), '--checkpoint', 'models/anywhere',
+                 '--minutes', '0.05', '--goals', '8', '--episodes', '1']) == 0
+    said = capsys.readouterr().out
+    assert 'the advised action loses' in said and 'on others' in said
+    taught = load_checkpoint(out / 'checkpoint')
+    assert 2 <= taught.config.places <= 64 and taught.config.moves == given.config.moves
+    before, after = given.network.state_dict(), taught.network.state_dict()
+    for name, tensor in before.items():
+        mine = after[name][:, :tensor.shape[1]] if name == 'memory.input_weight' else after[name]
+        assert torch.allclose(mine, tensor * (OWN if name.startswith('actor') else 1)), name
+    assert 'before teaching' in (out / 'evaluation.html').read_text()
 
 
 def raise_of(bag, out):

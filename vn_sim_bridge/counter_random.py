@@ -36,7 +36,6 @@ class Stream(enum.IntEnum):
     ODOMETRY = 19  # errors of odometry
     VIEW = 20  # of a recorded place
     VIEW_APPEARANCE = 21
-    EDGE = 22  # how a recorded place ends
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

@@ -27,8 +27,8 @@ FARTHEST, TURNED_MOST = 1.0, math.radians(30)  # m, rad
 NEAR, TURNED = 0.25, math.radians(15)  # m, rad
 GAP = 6  # layers between open ones that are open too: where a robot could not turn it is trapped
 STEP, TURN_STEP = 0.02, math.radians(2)  # a move is checked at this spacing [m, rad]
-# Where the floor ends a robot stops, or slides along: off its course by the first of these angles
-# that leads on. The edge is that of what was recorded, perhaps a wall, perhaps not.
+# Where the floor ends a robot slides along its edge: off its course by the first of these angles
+# that leads on. The edge is that of what was recorded, seldom a wall.
 ASIDE = tuple(math.radians(angle) for angle in (0, 15, -15, 30, -30, 45, -45, 60, -60, 75, -75))
 BORDER = 2  # cells around the floor
 # What an action costs on a shortest way: that ends well within the open states, or at their edge,
@@ -86,21 +86,18 @@ class PoseMap:
         """Numbers of the states that poses [N,>=3] are in; -1: closed."""
         return _states(np.ascontiguousarray(poses[:, :3], float), *self.lattice)
 
-    def drive(self, poses: np.ndarray, deltas: np.ndarray, slides: np.ndarray | None = None
-              ) -> tuple[np.ndarray, np.ndarray]:
+    def drive(self, poses: np.ndarray, deltas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Move robots in their own frames, up to where the open poses end.
 
         Args:
             poses: [N,>=3]; deltas: [N,>=3] dx, dy [m], dyaw [rad]. A simultaneous turn bends the
                 translation to the mean heading, as in `world.World.move`.
-            slides: [N] bool: along the edge of the open poses, see `ASIDE`; None: none does.
 
         Returns:
             [N,3] where they are then, and [N] the share of each move that was done.
         """
         return _drive(np.ascontiguousarray(poses[:, :3], float),
-                      np.ascontiguousarray(deltas[:, :3], float),
-                      np.zeros(len(poses), bool) if slides is None else slides, *self.lattice)
+                      np.ascontiguousarray(deltas[:, :3], float), *self.lattice)
 
     @functools.cached_property
     def leads(self) -> tuple[np.ndarray, np.ndarray]:
@@ -268,7 +265,7 @@ def _states(poses, x, y, state):
 
 
 @numba.njit(cache=True)
-def _move(px, py, yaw, dx, dy, dyaw, slides, x, y, state):
+def _move(px, py, yaw, dx, dy, dyaw, x, y, state):
     """The pose where a move ends, and the share of it that is done until nothing is open."""
     heading = yaw + 0.5 * dyaw
     c, s = math.cos(heading), math.sin(heading)
@@ -283,7 +280,7 @@ def _move(px, py, yaw, dx, dy, dyaw, slides, x, y, state):
             nx, ny = px + c * (c * mx - s * my), py + c * (s * mx + c * my)
             if _state(nx, ny, _wrap(yaw + turn), x, y, state) >= 0:
                 px, py, yaw, there = nx, ny, _wrap(yaw + turn), True
-            if there or still or not slides:
+            if there or still:
                 break
         if not there:
             return px, py, yaw, k / count
@@ -296,12 +293,12 @@ def _wrap(angle):
 
 
 @numba.njit(cache=True)
-def _drive(poses, deltas, slides, x, y, state):
+def _drive(poses, deltas, x, y, state):
     ends, share = np.empty((len(poses), 3)), np.empty(len(poses))
     for n in range(len(poses)):
         ends[n, 0], ends[n, 1], ends[n, 2], share[n] = _move(
-            poses[n, 0], poses[n, 1], poses[n, 2], deltas[n, 0], deltas[n, 1], deltas[n, 2],
-            slides[n], x, y, state)
+            poses[n, 0], poses[n, 1], poses[n, 2], deltas[n, 0], deltas[n, 1], deltas[n, 2], x, y,
+            state)
     return ends, share
 
 
@@ -313,7 +310,7 @@ def _leads(cells, moves, x, y, state):
         px, py = x + (cells[n, 1] + 0.5) * CELL, y + (cells[n, 0] + 0.5) * CELL
         for a in range(len(moves)):
             ex, ey, eyaw, share = _move(px, py, cells[n, 2] * HEADING, moves[a, 0], moves[a, 1],
-                                        moves[a, 2], False, x, y, state)
+                                        moves[a, 2], x, y, state)
             to[n, a] = _state(ex, ey, eyaw, x, y, state)
             cut[n, a] = share < 1.0
     return to, cut
@@ -406,7 +403,7 @@ def _values(pose, moves, costs, inner, x, y, state, values):
     """What the way costs by each first action; none that a contact ends at once, if there is."""
     for a in range(len(moves)):
         ex, ey, eyaw, share = _move(pose[0], pose[1], pose[2], moves[a, 0], moves[a, 1],
-                                    moves[a, 2], False, x, y, state)
+                                    moves[a, 2], x, y, state)
         end = _state(ex, ey, eyaw, x, y, state)
         values[a] = 2.0 * FAR
         if end >= 0 and share > 0.0:

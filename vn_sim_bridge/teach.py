@@ -38,7 +38,7 @@ def held_out(graph: ImageGraph) -> tuple[ImageGraph, ImageGraph | None]:
 
 
 def make_env(graph: ImageGraph, robot: RobotSpec, envs: int, *, privileged: tuple[str, ...] = (),
-             draw: bool = True, varied: bool = False, **options) -> NavigationEnv:
+             draw: bool = True, light: bool = False, **options) -> NavigationEnv:
     """A `NavigationEnv` in a graph.
 
     Args:
@@ -46,7 +46,7 @@ def make_env(graph: ImageGraph, robot: RobotSpec, envs: int, *, privileged: tupl
         robot: with the policy's actions alone.
         envs: robots.
         privileged: outputs that are asked for; what any environment tells is none of them.
-        draw, varied: see `ImageGraphBackend`.
+        draw, light: see `ImageGraphBackend`.
         options: further fields of `EnvConfig`.
     """
     config = EnvConfig(
@@ -54,7 +54,7 @@ def make_env(graph: ImageGraph, robot: RobotSpec, envs: int, *, privileged: tupl
         privileged=tuple(sorted(set(privileged) & set(PRIVILEGED))), **options)
     return NavigationEnv(config, robot,
                          backend=ImageGraphBackend(graph, envs, robot=robot, draw=draw,
-                                                   varied=varied))
+                                                   light=light))
 
 
 def make_pairs(own: ImageGraph, others: ImageGraph | None, robot: RobotSpec, seed: int

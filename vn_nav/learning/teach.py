@@ -7,6 +7,7 @@ The simulator's half, which makes a place out of pictures with poses, comes from
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import datetime
 import json
 import math
@@ -30,7 +31,7 @@ from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BANK, Views, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.pretrain_command import RECORDED, scene_of
-from vn_nav.learning.trainer import STATE, has_fast_bfloat16, train
+from vn_nav.learning.trainer import CHECKPOINT, STATE, has_fast_bfloat16, train
 from vn_nav.policy.checkpoint import (
     LoadedCheckpoint,
     load_checkpoint,
@@ -48,8 +49,11 @@ TEACHER = {'imitation': 1.0, 'imitation_until': 1.0, 'teacher': 'routes', 'teach
 # large a share of the minutes.
 FROM_NOTHING = {'epochs': 4, 'minibatches': 8, 'learning_rate': 1e-3}
 PAIR_SHARE = 0.1
-PLACES = 64  # spots that the policy tells apart
-PLACE_SHARE, ROUTE_SHARE = 0.07, 0.1  # of the minutes, to learn them, and the ways between
+PLACES, FOR_A_SPOT = 64, 4  # spots that the policy tells apart, and pictures for each at least
+PLACE_SHARE, ROUTE_SHARE = 0.07, 0.1  # of the minutes, to learn them, and the ways between;
+ALONE = (0.4, 0.6)  # and where that is all: a policy that finds pictures anywhere needs no more
+# Of the logits: what that policy thinks, and what it is advised. Each alone is too sure.
+OWN, ADVISED = 0.5, 0.6
 START = 'start'  # folder of the policy that knows the place, but no way there
 COLLISION_REWARD = -0.05  # of leaving what the pictures cover
 LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by
@@ -94,7 +98,7 @@ def add_teach_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--checkpoint', type=Path, metavar='DIR', help='begin with this policy, '
                         'for example models/anywhere: network, size and actions are its own; '
                         'default: from nothing')
-    parser.add_argument('--minutes', type=float, default=30.0, help='of learning')
+    parser.add_argument('--minutes', type=float, default=10.0, help='of learning')
     parser.add_argument('--robot', type=Path, metavar='YAML',
                         help='that drove, with its camera; default: the standard robot')
     parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
@@ -139,16 +143,21 @@ def teach(args: argparse.Namespace, place: Place) -> int:
         print(line, flush=True)
     args.out.mkdir(parents=True, exist_ok=True)
     place.draw_map(args.out / 'map.png', own, others)
-    world = ENVIRONMENT[PRESET] | {'collision_reward': COLLISION_REWARD}
-    env = place.make_env(own, robot, args.envs, seed=args.seed, privileged=config.privileged,
-                         varied=True,
-                         **{name: value for name, value in world.items() if name != 'envs'})
-    init = args.checkpoint
-    if args.places and not (args.resume and (args.out / STATE).is_file()):
-        init = _learn_places(args, place, own, robot, given, config)
-    folder = train(env, config, args.out, info=_info(args, robot, graph), resume=args.resume,
-                   init=init,
-                   pairs=lambda: place.make_pairs(own, others, robot, args.seed))
+    config = dataclasses.replace(config, places=min(config.places, len(graph.poses) // FOR_A_SPOT))
+    if args.places and given is not None:
+        folder = _learn_places(args, place, own, robot, given, config, ALONE, CHECKPOINT)
+    else:
+        world = ENVIRONMENT[PRESET] | {'collision_reward': COLLISION_REWARD}
+        env = place.make_env(own, robot, args.envs, seed=args.seed, privileged=config.privileged,
+                             light=True,
+                             **{name: value for name, value in world.items() if name != 'envs'})
+        init = args.checkpoint
+        if args.places and not (args.resume and (args.out / STATE).is_file()):
+            init = _learn_places(args, place, own, robot, given, config,
+                                 (PLACE_SHARE, ROUTE_SHARE), START)
+        folder = train(env, config, args.out, info=_info(args, robot, graph), resume=args.resume,
+                       init=init,
+                       pairs=lambda: place.make_pairs(own, others, robot, args.seed))
     _evaluate(args, place, folder, given, robot, dict(zip(SPLITS, (own, others), strict=True)))
     print(folder)
     return 0
@@ -247,8 +256,13 @@ def _poses(args: argparse.Namespace, drives: DriveSet, robot: RobotSpec, topics:
 
 
 def _learn_places(args: argparse.Namespace, place: Place, graph, robot: RobotSpec,
-                  given: LoadedCheckpoint | None, config: TrainConfig) -> Path:
-    """Know the place by its pictures; the policy to go on with."""
+                  given: LoadedCheckpoint | None, config: TrainConfig,
+                  shares: tuple[float, float], name: str) -> Path:
+    """Know the place and its ways by its pictures, each for a share of the minutes.
+
+    Returns:
+        The folder of the policy, of this name.
+    """
     torch.set_num_threads(config.threads)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(args.seed)
@@ -261,15 +275,20 @@ def _learn_places(args: argparse.Namespace, place: Place, graph, robot: RobotSpe
         print(words, flush=True)
     views, others = place.make_views(graph, robot, args.seed)
     facts = fit_places(network, views, others, graph.poses[:, :2],
-                       minutes=PLACE_SHARE * args.minutes, say=say)
-    until = time.monotonic() + 60 * ROUTE_SHARE * args.minutes
+                       minutes=shares[0] * args.minutes, say=say)
+    until = time.monotonic() + 60 * shares[1] * args.minutes
     pictures, poses = views.draw(BANK)
     facts |= fit_routes(network, pictures, graph.pictures[list(graph.goal_nodes)],
                         place.regrets(graph, poses), until=until, say=say, seed=args.seed)
-    save_checkpoint(args.out / START, network, {
+    if given is not None:
+        with torch.no_grad():
+            for layer, share in ((network.actor, OWN), (network.routes.advise, ADVISED)):
+                for part in layer.parameters():
+                    part *= share
+    save_checkpoint(args.out / name, network, {
         **_info(args, robot, graph), 'frames': 0, 'seed': args.seed,
-        'minutes': (PLACE_SHARE + ROUTE_SHARE) * args.minutes, 'results': {'places': facts}})
-    return args.out / START
+        'minutes': sum(shares) * args.minutes, 'results': {'places': facts}})
+    return args.out / name
 
 
 def _widened(given: dict[str, torch.Tensor], network: Policy) -> dict[str, torch.Tensor]:
@@ -331,7 +350,7 @@ def _evaluate(args: argparse.Namespace, place: Place, folder: Path,
 def _measure(args: argparse.Namespace, place: Place, graph, robot: RobotSpec, network: Policy,
              controls, threshold: float) -> evaluator.Rows:
     def make(_, envs: int, stop: str):
-        return place.make_env(graph, robot, envs, stop=stop, varied=True,
+        return place.make_env(graph, robot, envs, stop=stop, light=True,
                               max_decisions=ENVIRONMENT[PRESET]['max_decisions'])
     return evaluator.measure(make, network, [graph.seed], decoding='sample',
                              episodes=args.episodes, controls=controls, threshold=threshold,

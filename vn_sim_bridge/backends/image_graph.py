@@ -10,7 +10,7 @@ import numpy as np
 
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.backends.base import Capabilities, Frames, Motion
-from vn_sim_bridge.counter_random import Stream, uniform
+from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.house import CELL
 from vn_sim_bridge.image_graph import ImageGraph
 from vn_sim_bridge.pose_map import FARTHEST, GAP, HEADING, NEAR, TURNED, TURNED_MOST, in_sight
@@ -18,7 +18,6 @@ from vn_sim_bridge.relight import draw_light, relight
 from vn_sim_bridge.render.pack import no_objects
 
 BUCKET = 0.5  # m, side of the squares that nodes are looked for in
-SLIDING = 0.3  # share of the episodes in which robots slide along the edge of the floor
 AS_GOOD = 0.5  # a node that is farther than the nearest one by no more may be shown instead
 SHARP = math.radians(0.5)  # rad: a picture is not turned by less
 
@@ -36,13 +35,12 @@ class ImageGraphBackend:
         num_envs: robots, N.
         robot: its camera.
         draw: whether to draw among the near nodes; False: always the nearest.
-        varied: whether every episode has a light of its own, see `relight`, and, of its own too,
-            edges of the floor that stop the robot or let it slide along. What `view` returns,
+        light: whether every episode has a light of its own, see `relight`. What `view` returns,
             goals too, is as it was recorded.
     """
 
     def __init__(self, graph: ImageGraph, num_envs: int, *, robot: RobotSpec, draw: bool = True,
-                 varied: bool = False):
+                 light: bool = False):
         self.houses, self.graph, self.robot, self.num_envs = [graph], graph, robot, num_envs
         self.capabilities = Capabilities(
             continuous=True, depth=graph.depth is not None, labels=False, geodesic=True,
@@ -54,9 +52,8 @@ class ImageGraphBackend:
         self.objects = no_objects(num_envs, 0)
         self.routes = graph.map
         self._draw = draw
-        self._light = (np.tile(np.arange(256, dtype=np.uint8), (num_envs, 3, 1)) if varied
+        self._light = (np.tile(np.arange(256, dtype=np.uint8), (num_envs, 3, 1)) if light
                        else None)
-        self._slides = np.zeros(num_envs, bool)
         self._index = _make_index(graph.poses)
         self._node = np.zeros(num_envs, np.int64)  # that was shown last
         self.seen_from = self.poses.copy()
@@ -74,7 +71,7 @@ class ImageGraphBackend:
         """Displace robots by [K,4] in their own frames, up to where no picture is near."""
         env_ids = self._all if env_ids is None else env_ids
         before = self.poses[env_ids]
-        ends, share = self.graph.map.drive(before, delta, self._slides[env_ids])
+        ends, share = self.graph.map.drive(before, delta)
         self.poses[env_ids, :3] = ends
         done = np.zeros((len(before), 4))
         # In the frame of the mean heading, as `World` has it.
@@ -95,11 +92,10 @@ class ImageGraphBackend:
         """Of views: light and camera are as they were recorded."""
 
     def dress(self, env_ids: np.ndarray, seed: int, stream: Stream, env, episode) -> None:
-        """Draw the light of episodes, and how the floor ends."""
+        """Draw the light of episodes."""
         if self._light is not None:
             env, episode = (np.broadcast_to(part, env_ids.shape) for part in (env, episode))
             self._light[env_ids] = draw_light(seed, stream, env, episode)
-            self._slides[env_ids] = uniform(seed, Stream.EDGE, env, episode) < SLIDING
 
     def set_objects(self, env_id: int, placed) -> None:
         """There are none."""
