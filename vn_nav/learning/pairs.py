@@ -165,7 +165,7 @@ def look(network: Policy, views: np.ndarray, first: np.ndarray, second: np.ndarr
         The poses of K pairs, and maps [K,C,h,w].
     """
     shown = torch.from_numpy(views)
-    goals = network.encode_goals(shown)
+    goals, _ = network.goal_parts(network.encode_goals(shown))
     seen = network.encoder.see(shown, network.compute_dtype)
     maps, features = network.encoder.meet(seen[first], goals[second], None)
     return network.heads['goal_pose'](features), maps

@@ -300,7 +300,7 @@ class Policy(nn.Module):
                 starts[0] = True
         if goal_maps is None:
             goal_maps = self.encode_goals(obs.goals)
-        goal_maps, goal_places = self._parts(goal_maps)
+        goal_maps, goal_places = self.goal_parts(goal_maps)
         maps, features, state = self._look(obs, starts, state, goal_maps)
         if self.frozen:
             scene = self._scene(obs)
@@ -346,10 +346,10 @@ class Policy(nn.Module):
         if starts is None:
             starts = torch.zeros_like(obs.last_action, dtype=torch.bool)
             starts[0] = True
-        goal_maps, _ = self._parts(self.encode_goals(obs.goals))
+        goal_maps, _ = self.goal_parts(self.encode_goals(obs.goals))
         return self._look(obs, starts, self.initial_state(starts.shape[1]), goal_maps)[0]
 
-    def _parts(self, goal_maps: Tensor) -> tuple[Tensor, Tensor | None]:
+    def goal_parts(self, goal_maps: Tensor) -> tuple[Tensor, Tensor | None]:
         """What the encoder keeps of goals, and where they were taken, out of `encode_goals`."""
         if self.places is None:
             return goal_maps, None
