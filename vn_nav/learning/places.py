@@ -174,5 +174,3 @@ def _targets(spots: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
 def _words(seen: int, metres: float, degrees: float) -> str:
     return (f'places: {seen:,} pictures · on others: {metres:.2f} m, {degrees:.0f} deg off '
             '(medians)')
-
-

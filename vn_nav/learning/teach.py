@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
+import functools
 import json
 import math
 import shlex
@@ -271,8 +272,7 @@ def _learn_places(args: argparse.Namespace, place: Place, graph, robot: RobotSpe
     if given is not None:
         network.load_state_dict(_widened(given.network.state_dict(), network))
     network.compute_dtype = torch.bfloat16 if has_fast_bfloat16() else torch.float32
-    def say(words: str) -> None:
-        print(words, flush=True)
+    say = functools.partial(print, flush=True)
     views, others = place.make_views(graph, robot, args.seed)
     facts = fit_places(network, views, others, graph.poses[:, :2],
                        minutes=shares[0] * args.minutes, say=say)
