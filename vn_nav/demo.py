@@ -38,7 +38,7 @@ from vn_nav.robot import RobotSpec
 TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
 UNSEEN_HOUSE = 8  # seed
 SEED = 2026  # of starts and goals
-HEARS = 20.0  # s until the recorder has met a node
+HEARS = 60.0  # s until the recorder has met a node
 STALL = 60.0  # s without a finished episode after which the demo gives up
 LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up|stopped elsewhere) after (\d+) '
                   r'decisions, ([\d.]+) m')
