@@ -73,6 +73,15 @@ def keep_curve(folder: Path, curves: Path = CURVES) -> None:
         writer.writerows(thinned)
 
 
+def write_table(curves: Path) -> None:
+    """Table and figure of a folder of curves, into that folder."""
+    subprocess.run([sys.executable, '-m', 'vn_nav.cli', 'compare',
+                    *(str(folder.relative_to(ROOT)) for folder in sorted(curves.iterdir())
+                      if folder.is_dir()),
+                    '--out', str(curves / 'table.html'), '--json', str(curves / 'table.json')],
+                   check=True, cwd=ROOT)
+
+
 def main():
     """Run what is missing, two at a time, each pinned to a core of its own."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -113,11 +122,7 @@ def main():
                         stdout=log, stderr=subprocess.STDOUT, cwd=ROOT,
                         env=os.environ | {'OMP_NUM_THREADS': '1'}), folder, minutes
         time.sleep(10)
-    subprocess.run([sys.executable, '-m', 'vn_nav.cli', 'compare',
-                    *(str(folder.relative_to(ROOT)) for folder in sorted(CURVES.iterdir())
-                      if folder.is_dir()),
-                    '--out', str(CURVES / 'table.html'), '--json', str(CURVES / 'table.json')],
-                   check=True, cwd=ROOT)
+    write_table(CURVES)
 
 
 if __name__ == '__main__':

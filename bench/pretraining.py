@@ -28,7 +28,7 @@ import sys
 import time
 from pathlib import Path
 
-from learning import HOUSE, ROOMS, ROOT, is_over, keep_curve
+from learning import HOUSE, ROOMS, ROOT, is_over, keep_curve, write_table
 
 CURVES = ROOT / 'docs' / 'curves' / 'pretraining'
 PICTURES = 20_000  # thesis, 5.7
@@ -112,11 +112,7 @@ def main():
     for seed in options.seeds:
         for arm in options.arms:
             train(runs, arm, seed, first.get(arm), options.minutes)
-    subprocess.run([sys.executable, '-m', 'vn_nav.cli', 'compare',
-                    *(str(folder.relative_to(ROOT)) for folder in sorted(CURVES.iterdir())
-                      if folder.is_dir()),
-                    '--out', str(CURVES / 'table.html'), '--json', str(CURVES / 'table.json')],
-                   check=True, cwd=ROOT)
+    write_table(CURVES)
 
 
 if __name__ == '__main__':

@@ -208,6 +208,12 @@ def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, caps
         mine = after[name][:, :tensor.shape[1]] if name == 'memory.input_weight' else after[name]
         assert torch.allclose(mine, tensor * (OWN if name.startswith('actor') else 1)), name
     assert 'before teaching' in (out / 'evaluation.html').read_text()
+    # Taught once more, it counts no less than before.
+    assert main(['teach', str(bag), '--out', str(tmp_path / 'again'), '--checkpoint',
+                 str(out / 'checkpoint'), '--minutes', '0.05', '--goals', '8', '--episodes',
+                 '1']) == 0
+    again = load_checkpoint(tmp_path / 'again' / 'checkpoint').network
+    assert torch.equal(again.actor.weight, taught.network.actor.weight)
 
 
 def raise_of(bag, out):

@@ -281,14 +281,19 @@ def _learn_places(args: argparse.Namespace, place: Place, graph, robot: RobotSpe
     facts |= fit_routes(network, pictures, graph.pictures[list(graph.goal_nodes)],
                         place.regrets(graph, poses), until=until, say=say, seed=args.seed)
     if given is not None:
-        with torch.no_grad():
-            for layer, share in ((network.actor, OWN), (network.routes.advise, ADVISED)):
-                for part in layer.parameters():
-                    part *= share
+        _blend(network, own=1.0 if given.config.places else OWN)
     save_checkpoint(args.out / name, network, {
         **_info(args, robot, graph), 'frames': 0, 'seed': args.seed,
         'minutes': sum(shares) * args.minutes, 'results': {'places': facts}})
     return args.out / name
+
+
+@torch.no_grad()
+def _blend(network: Policy, own: float) -> None:
+    """Weigh what a policy thinks, which one that was taught before has weighed, and the advice."""
+    for layer, share in ((network.actor, own), (network.routes.advise, ADVISED)):
+        for part in layer.parameters():
+            part *= share
 
 
 def _widened(given: dict[str, torch.Tensor], network: Policy) -> dict[str, torch.Tensor]:
