@@ -91,6 +91,7 @@ setup(
         'test': [
             'pytest>=8',
             'pytest-timeout>=2.3',
+            'pytest-xdist>=3.6',  # what computes uses all cores
             'hypothesis>=6.100',
             'pymcap-cli>=0.34',  # a judge of our bags that shares no code with us
             'ruff>=0.6',

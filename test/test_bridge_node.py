@@ -71,6 +71,8 @@ class Listener:
         wait_until(lambda: self.pose('odom')[3:6].any(), self.spin, 20)
         self.command.publish(Twist())
         wait_until(lambda: not self.pose('odom')[3:6].any(), self.spin, 20)
+        # Each topic has its own way here: what stands on one may still be under way on another.
+        wait_until(lambda: self.pose()[6] >= self.pose('odom')[6], self.spin, 20)
         return self.hears('reward', rewards + 1).data
 
     def pose(self, name='ground_truth/odom'):

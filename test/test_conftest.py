@@ -1,47 +1,57 @@
 """A skip that nobody planned fails the session, whichever way it comes about."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 CONFTEST = Path(__file__).with_name('conftest.py')
 
 
-def run_pytest(tmp_path, source):
+def run_pytest(tmp_path, *sources):
+    """What a session says of one module for each source, all of them in one folder."""
     (tmp_path / 'conftest.py').write_text(CONFTEST.read_text())
-    (tmp_path / 'test_inner.py').write_text(f'import pytest\n\n\n{source}\n')
+    for number, source in enumerate(sources):
+        (tmp_path / f'test_inner_{number}.py').write_text(f'import pytest\n\n\n{source}\n')
     return subprocess.run(
         [sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', str(tmp_path)],
         cwd=tmp_path, capture_output=True, text=True, timeout=60,
-        env={name: value for name, value in os.environ.items() if name != 'PYTEST_ADDOPTS'})
+        env={name: value for name, value in os.environ.items()
+             if not name.startswith('PYTEST_')})
 
 
-@pytest.mark.parametrize('source', [
-    'def test_inner():\n    pytest.skip("no reason")',
-    '@pytest.mark.skip(reason="later")\ndef test_inner():\n    pass',
-    '@pytest.mark.skipif(True, reason="not here")\ndef test_inner():\n    pass',
-    'pytest.importorskip("a_module_that_nobody_has")\n\n\ndef test_inner():\n    pass',
-    '@pytest.fixture\ndef thing():\n    pytest.skip("in a fixture")\n\n\n'
-    'def test_inner(thing):\n    pass',
-], ids=['call', 'mark', 'condition', 'module', 'fixture'])
-def test_an_unexpected_skip_fails(tmp_path, source):
-    result = run_pytest(tmp_path, source)
+def test_an_unexpected_skip_fails(tmp_path):
+    sources = [
+        'def test_inner():\n    pytest.skip("no reason")',
+        '@pytest.mark.skip(reason="later")\ndef test_inner():\n    pass',
+        '@pytest.mark.skipif(True, reason="not here")\ndef test_inner():\n    pass',
+        '@pytest.fixture\ndef thing():\n    pytest.skip("in a fixture")\n\n\n'
+        'def test_inner(thing):\n    pass']
+    result = run_pytest(tmp_path, *sources)
+    assert result.returncode != 0, result.stdout
+    assert ' 1 failed, 3 errors' in result.stdout and 'passed' not in result.stdout
+    for number in range(len(sources)):
+        assert re.search(rf'(FAILED|ERROR) test_inner_{number}.py.*unexpected skip',
+                         result.stdout), (number, result.stdout)
+
+
+def test_an_unexpected_skip_of_a_module_fails(tmp_path):
+    result = run_pytest(
+        tmp_path,
+        'pytest.importorskip("a_module_that_nobody_has")\n\n\ndef test_inner():\n    pass')
     assert result.returncode != 0, result.stdout
     assert 'unexpected skip' in result.stdout
 
 
-@pytest.mark.parametrize('source', [
-    'def test_inner():\n    pytest.skip("expected: no GPU")',
-    'def test_inner():\n    pytest.xfail("known")',
-    'def test_inner():\n    pass',
-], ids=['expected', 'xfail', 'pass'])
-def test_the_rest_passes(tmp_path, source):
-    result = run_pytest(tmp_path, source)
+def test_the_rest_passes(tmp_path):
+    result = run_pytest(tmp_path, *(
+        'def test_inner():\n    pytest.skip("expected: no GPU")',
+        'def test_inner():\n    pytest.xfail("known")',
+        'def test_inner():\n    pass'))
     assert result.returncode == 0, result.stdout
     assert 'unexpected skip' not in result.stdout
+    assert '1 passed, 1 skipped, 1 xfailed' in result.stdout
 
 
 def test_sessions_side_by_side_take_different_domains(tmp_path):

@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 
 from vn_nav.cli import main
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(240)]  # drives over ROS
 
 
 @pytest.fixture(scope='module')
@@ -70,7 +70,6 @@ def test_every_figure_is_in_the_bag(demo):
         assert figures['random']['episodes'] == count
 
 
-@pytest.mark.slow  # a second drive over ROS
 def test_declared_stops_are_counted_from_the_bag(tmp_path):
     sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
     assert main(['demo', '--out', str(tmp_path / 'out'), '--checkpoint', str(sure),

@@ -39,7 +39,7 @@ RUN = TrainConfig(frames=900, rollout_length=16, channels=(8, 8, 8), features=24
                   epochs=1, minibatches=2, bf16=False, curriculum='success', advance_window=20,
                   success_to_advance=0.05)
 ENVS = 4
-pytestmark = pytest.mark.timeout(300)  # two more processes have to start
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]  # two more processes have to start
 
 
 @pytest.fixture(autouse=True)
@@ -215,7 +215,6 @@ def workers(torchrun):
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_torchrun_replaces_a_killed_worker_and_the_run_ends(tmp_path):
     folder, frames = tmp_path / 'run', 6000

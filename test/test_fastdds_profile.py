@@ -59,6 +59,7 @@ rclpy.shutdown()
 
 
 @pytest.mark.ros
+@pytest.mark.slow
 @pytest.mark.parametrize('profile', PROFILES)
 def test_vga_pictures_arrive(profile):
     environment = {**os.environ,

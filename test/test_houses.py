@@ -83,6 +83,7 @@ def test_impossible_houses_are_refused(seed, rooms):
         generate_house(seed, rooms=rooms)
 
 
+@pytest.mark.slow  # 60 houses
 def test_houses_are_distinct():
     seen = {generate_house(seed, rooms=2).scene.vertices.tobytes() for seed in range(60)}
     assert len(seen) == 60
@@ -96,6 +97,7 @@ def test_splits_are_disjoint_and_frozen():
         'train', 'train', 'validation', 'test', 'unseen_look']
 
 
+@pytest.mark.slow  # 24 houses
 def test_the_unseen_look_shares_nothing_with_the_standard_one():
     for field in STANDARD._fields:
         one, other = ({value} if isinstance(value, str) else set(value)
@@ -112,6 +114,7 @@ def test_the_unseen_look_shares_nothing_with_the_standard_one():
     assert len(used[0]) > 20 and len(used[1]) > 15
 
 
+@pytest.mark.slow  # 30 houses of nine rooms
 def test_furniture_has_many_classes_of_several_parts():
     parts = {}
     for seed in range(30):

@@ -285,7 +285,8 @@ def test_the_total_gradient_is_the_weighted_sum(size):
         assert losses[name] == pytest.approx(float(parts[name].detach()), rel=1e-4), name
 
 
-@pytest.mark.parametrize('name', PRESETS)
+@pytest.mark.parametrize('name', [pytest.param(name, marks=pytest.mark.slow) if name == 'anywhere'
+                                  else name for name in PRESETS])
 def test_equal_seeds_give_equal_updates(name):
     """Bit for bit on one thread: two rollouts and updates, run twice."""
     def run():

@@ -39,6 +39,7 @@ def run(executable, prefix):
                           capture_output=True, text=True, timeout=100)
 
 
+@pytest.mark.slow
 def test_pip_install(prefix):
     share = prefix / 'share' / 'vn_nav'
     assert (prefix / 'share/ament_index/resource_index/packages/vn_nav').is_file()

@@ -48,6 +48,7 @@ def learn(drives, folder, config=QUICK, network=None, parts=None, **options):
                     **options)
 
 
+@pytest.mark.slow
 def test_actions_and_poses_are_learned_and_hold_on_other_episodes(tmp_path):
     drives = Drives([drive_set(120)], ROBOT)
     network = network_of(('goal_pose',), channels=(16, 24, 24), features=64, hidden=32)

@@ -98,6 +98,7 @@ def test_what_is_lost_is_counted(talker, tmp_path):
         time.sleep(0.5)
         publish(50)
         wait_until(lambda: 'lost in the last second' in (tmp_path / 'log').read_text(), pause)
+        time.sleep(2.0)  # what waits in the reader when it ends is neither received nor lost
         interrupt(process)
     words, = re.findall(r'/odom: (\d+) received, (\d+) written, (\d+) lost',
                         (tmp_path / 'log').read_text())
