@@ -2,6 +2,7 @@
 
     python bench/pretraining.py --runs runs/pretraining                # everything, one core
     python bench/pretraining.py --runs runs/pretraining --seeds 0      # a part of it
+    python bench/pretraining.py --no-curriculum --minutes 6            # goals anywhere at once
 
 The task of `bench/learning.py`: the preset `fast` in a house of two rooms. Three ways to begin,
 none of them with the picture pairs of the simulator that `fast` otherwise learns from first:
@@ -13,7 +14,8 @@ none of them with the picture pairs of the simulator that `fast` otherwise learn
   recorded by `recorder_node`: all heads, goal poses by hindsight, and cloning.
 
 The weights are pre-trained once, the reinforcement has several seeds. What was interrupted goes
-on, what has ended is not repeated. Curves go to docs/curves/pretraining/.
+on, what has ended is not repeated. Curves go to docs/curves/pretraining/, those without the
+curriculum, whose own steps take most of the frames of this house, to a folder beside.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from pathlib import Path
 from learning import HOUSE, ROOMS, ROOT, is_over, keep_curve, write_table
 
 CURVES = ROOT / 'docs' / 'curves' / 'pretraining'
+WHOLE = CURVES.with_name('pretraining-whole')  # of the curves without a curriculum
 PICTURES = 20_000  # thesis, 5.7
 IMAGE_HEADS = 'depth,segmentation,goal_segmentation'
 SCRATCH, IMAGES, CLONING = ARMS = ('scratch', 'images', 'cloning')
@@ -74,14 +77,16 @@ def pretrain(runs: Path, epochs: int) -> dict[str, Path]:
     return {arm: runs / arm / 'checkpoint' for arm in first}
 
 
-def train(runs: Path, arm: str, seed: int, init: Path | None, minutes: float) -> None:
+def train(runs: Path, arm: str, seed: int, init: Path | None, minutes: float,
+          curriculum: bool) -> None:
     """One run of reinforcement, until it has held the highest success for a while."""
     folder = runs / f'{arm}-seed{seed}'
     if not is_over(folder, minutes):
         words = [sys.executable, '-m', 'vn_nav.cli', 'train', '--preset', 'fast',
                  '--house', str(HOUSE), '--rooms', str(ROOMS), '--seed', str(seed),
                  '--minutes', str(minutes), '--frames', '1e9', '--max-decisions', '300',
-                 '--pair-minutes', '0', '--no-tensorboard', '--out', str(folder)]
+                 '--pair-minutes', '0', '--no-tensorboard', '--out', str(folder),
+                 *(() if curriculum else ('--set', 'start_difficulty=1.0'))]
         words += ['--resume'] if folder.exists() else ['--init', str(init)] if init else []
         print(f'{folder.name}, {minutes:g} minutes at most', flush=True)
         with open(runs / f'{folder.name}.log', 'a') as log:
@@ -94,7 +99,7 @@ def train(runs: Path, arm: str, seed: int, init: Path | None, minutes: float) ->
                 process.wait()
         if process.returncode:
             raise SystemExit(f'{folder.name} ended with {process.returncode}: see its log')
-    keep_curve(folder, CURVES)
+    keep_curve(folder, CURVES if curriculum else WHOLE)
 
 
 def main():
@@ -105,14 +110,17 @@ def main():
     parser.add_argument('--arms', nargs='+', choices=ARMS, default=ARMS)
     parser.add_argument('--epochs', type=int, default=30, help='thesis, table 5.1')
     parser.add_argument('--minutes', type=float, default=MINUTES, help='of a run at most')
+    parser.add_argument('--curriculum', action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
     runs = options.runs.resolve()
     runs.mkdir(parents=True, exist_ok=True)
     first = pretrain(runs, options.epochs)
+    where = runs if options.curriculum else runs / WHOLE.name
+    where.mkdir(exist_ok=True)
     for seed in options.seeds:
         for arm in options.arms:
-            train(runs, arm, seed, first.get(arm), options.minutes)
-    write_table(CURVES)
+            train(where, arm, seed, first.get(arm), options.minutes, options.curriculum)
+    write_table(CURVES if options.curriculum else WHOLE)
 
 
 if __name__ == '__main__':

@@ -101,6 +101,26 @@ def test_runtime_and_batched_policy_agree(tmp_path, frames):
         runtime.act(np.zeros((3, 20, 20), np.uint8))
 
 
+def test_a_policy_that_knows_its_moves_does_not_repeat_a_contact(tmp_path):
+    config = dataclasses.replace(
+        SMALL, heads=('goal_pose',), pose_to_memory=True,
+        moves=((0.5, 0, 0), (-0.2, 0, 0), (0, 0, 0.5236), (0, 0, -0.5236)))
+    network = Policy(config)
+    with torch.no_grad():
+        network.actor.bias.copy_(torch.tensor([9.0, 6.0, 3.0, 0.0]))
+    save_checkpoint(tmp_path / 'model', network, FACTS)
+    picture, goals = pictures(1)[0], pictures(1, seed=1)
+    runtime = PolicyRuntime(tmp_path / 'model', decoding='greedy')
+    runtime.set_goal(goals[0])
+    policy = BatchedPolicy(network, 1, 'greedy')
+    done = [-1]
+    for _ in range(4):
+        done.append(runtime.act(picture))
+        same = policy.act(observed(picture[None], done[-2]), goals, np.array([done[-2] < 0]))
+        assert done[-1] == same[0]
+    assert done[1:] == [0, 1, 2, 0]  # the turn showed the same, too, but is no contact
+
+
 def test_not_finite_output_is_an_error():
     network = Policy(SMALL)
     with torch.no_grad():

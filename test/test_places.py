@@ -17,7 +17,7 @@ from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spo
 from vn_nav.learning.teach import _widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import NetworkConfig, Policy
-from vn_nav.policy.places import HEADINGS
+from vn_nav.policy.places import HEADINGS, LookAround
 from vn_sim_bridge.backends.image_graph import ImageGraphBackend
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.graph_views import GraphViews
@@ -151,6 +151,26 @@ def test_imitation_reaches_what_is_acted_upon():
     logits = network(seen, starts)[0].logits[:2]
     assert loss.item() == pytest.approx(
         F.cross_entropy(logits.flatten(0, 1), action.flatten()).item(), abs=1e-5)
+
+
+def test_who_turns_on_the_spot_knows_it_by_all_its_pictures():
+    around = LookAround(((0.5, 0, 0), (-0.2, 0, 0), (0, 0, 0.5), (0, 0, -0.5)), 3)
+    here = torch.rand(7, 1, 3 + HEADINGS)
+    actions = torch.tensor([-1, 2, 3, 0, 2, 2, 3])[:, None]
+    starts = torch.tensor([True, False, False, False, False, True, False])[:, None]
+    said, remembered = around(here, actions, starts, torch.full((1, 4), 9.0))
+    spots = here[..., :3]
+    expected = [spots[0], spots[:2].mean(0), spots[:3].mean(0),  # turns
+                spots[3], spots[3:5].mean(0),  # has driven on
+                spots[5], spots[5:].mean(0)]  # another episode
+    assert torch.allclose(said[..., :3], torch.stack(expected), atol=1e-6)
+    assert torch.equal(said[..., 3:], here[..., 3:])
+    assert remembered[0, 3] == 2
+    stepwise, state = [], torch.zeros(1, 4)
+    for t in range(7):
+        row, state = around(here[t:t + 1], actions[t:t + 1], starts[t:t + 1], state)
+        stepwise.append(row)
+    assert torch.equal(torch.cat(stepwise), said) and torch.equal(state, remembered)
 
 
 def test_advice_of_a_goal_reaches_its_own_robot():

@@ -53,8 +53,8 @@ PAIR_SHARE = 0.1
 PLACES, FOR_A_SPOT = 64, 4  # spots that the policy tells apart, and pictures for each at least
 PLACE_SHARE, ROUTE_SHARE = 0.07, 0.1  # of the minutes, to learn them, and the ways between;
 ALONE = (0.4, 0.6)  # and where that is all: a policy that finds pictures anywhere needs no more
-# Of the logits: what that policy thinks, and what it is advised. Each alone is too sure.
-OWN, ADVISED = 0.5, 0.6
+# Of the logits: what that policy thinks, and what it is advised.
+OWN, ADVISED = 0.75, 0.9
 START = 'start'  # folder of the policy that knows the place, but no way there
 COLLISION_REWARD = -0.05  # of leaving what the pictures cover
 LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by

@@ -21,6 +21,9 @@ that its network uses:
 | `arrival` | float32 [1] | logit: the robot stands where the goal was taken |
 | `next_hidden`, `next_cell` | | the memory, to pass next time |
 
+What contacts teach (`vn_nav.policy.contacts`) is not in the files: of a policy that knows its
+moves add it to the logits.
+
 The metadata of both files are strings: `action_names` (JSON, in the order of the logits), `size`
 (S), `camera_fov_deg`, `camera_height` [m], `decoding` (sample or greedy), `stop_threshold`
 (probability of arrival; empty: none), `world_version`, `task`, `sha256` of the checkpoint's

@@ -31,7 +31,7 @@ from vn_nav.policy.memory import (
     RecurrentState,
     stack_frames,
 )
-from vn_nav.policy.places import WIDTH, PlaceRecogniser, Routes
+from vn_nav.policy.places import WIDTH, LookAround, PlaceRecogniser, Routes
 from vn_nav.policy.zhu import FROZEN, SceneLinear, Siamese
 
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
@@ -175,8 +175,10 @@ class Policy(nn.Module):
             self.memory = Feedforward(inputs, config.hidden)
         else:
             self.memory = MaskedLSTM(inputs, config.hidden, thesis=thesis)
-        self.places = self.routes = None
+        self.places = self.routes = self.around = None
         if config.places:
+            if config.moves:
+                self.around = LookAround(config.moves, config.places)
             self.places = PlaceRecogniser(config.size, config.places, config.pixel_mean,
                                           config.pixel_std)
             self.routes = Routes(self.places.width, len(config.actions))
@@ -196,7 +198,7 @@ class Policy(nn.Module):
     def _build_scenes(self) -> None:
         """The parts of icra2017, see `vn_nav.policy.zhu`."""
         config, width = self.config, self.config.hidden
-        self.places = None
+        self.places = self.tracker = self.around = None
         self.encoder = Siamese(config.frozen, config.frames, width)
         self.memory = SceneLinear(width, width, config.scenes)
         self.actor = SceneLinear(width, len(config.actions), config.scenes)
@@ -237,8 +239,14 @@ class Policy(nn.Module):
                                      device=self.device)
             return RecurrentState(before, torch.zeros(batch, 0, device=self.device))
         zeros = torch.zeros(batch, config.hidden, device=self.device)
-        tracked = torch.zeros(batch, GoalTracker.WIDTH if config.moves else 0, device=self.device)
-        return RecurrentState(torch.cat([zeros, tracked], dim=1), zeros.clone())
+        beside = torch.zeros(batch, sum(self._beside), device=self.device)
+        return RecurrentState(torch.cat([zeros, beside], dim=1), zeros.clone())
+
+    @property
+    def _beside(self) -> tuple[int, int]:
+        """Numbers that are remembered beside the memory's own, by tracker and look around."""
+        return (0 if self.tracker is None else GoalTracker.WIDTH,
+                0 if self.around is None else self.around.width)
 
     @property
     def device(self) -> torch.device:
@@ -317,25 +325,32 @@ class Policy(nn.Module):
             pose = self.heads['goal_pose'](features)
             if self.config.pose_to_memory:
                 inputs.append(_compass(pose).view(steps, batch, -1).to(dtype))
+        own = state
+        beside: list[Tensor] = []
+        if any(self._beside):
+            hidden, tracked, looked = state.hidden.split((self.config.hidden, *self._beside), 1)
+            own = RecurrentState(hidden, state.cell)
         if self.tracker is not None:
-            own = self.config.hidden
-            seen, estimate = self.tracker(
+            seen, tracked = self.tracker(
                 *(part.detach().view(steps, batch, *part.shape[1:]) for part in pose),
-                obs.last_action, starts, state.hidden[:, own:])
+                obs.last_action, starts, tracked)
             inputs.append(seen.to(dtype))
+            beside.append(tracked)
         if self.places is not None:
             if obs.goal_index is not None:
                 goal_places = goal_places[obs.goal_index.flatten()]
-            here = self.places(obs.image.flatten(0, 1), self.compute_dtype).to(dtype)
-            told, advice = self.routes(here, goal_places)
+            here = self.places(obs.image.flatten(0, 1), self.compute_dtype)
+            if self.around is not None:
+                here, looked = self.around(here.view(steps, batch, -1), obs.last_action, starts,
+                                           looked)
+                here = here.flatten(0, 1)
+                beside.append(looked)
+            told, advice = self.routes(here.to(dtype), goal_places)
             inputs.append(told.view(steps, batch, -1))
             advice = advice.view(steps, batch, -1)
-        if self.tracker is not None:
-            hidden, state = self.memory(torch.cat(inputs, dim=-1), starts,
-                                        RecurrentState(state.hidden[:, :own], state.cell))
-            state = RecurrentState(torch.cat([state.hidden, estimate], dim=1), state.cell)
-        else:
-            hidden, state = self.memory(torch.cat(inputs, dim=-1), starts, state)
+        hidden, state = self.memory(torch.cat(inputs, dim=-1), starts, own)
+        if beside:
+            state = RecurrentState(torch.cat([state.hidden, *beside], dim=1), state.cell)
         return Latents(maps, features, hidden, pose, advice=advice), state
 
     def maps(self, obs: Observation, starts: Tensor | None = None) -> Tensor:

@@ -10,6 +10,7 @@ spots of the floor and over headings, which can say "here or there" where a pose
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -82,6 +83,53 @@ class PlaceRecogniser(nn.Module):
         angle = heading_cells(code.device)
         y, x = (code[:, spots:] @ part(angle) for part in (torch.sin, torch.cos))
         return torch.cat([position, torch.atan2(y, x).unsqueeze(1)], dim=1)
+
+
+class LookAround(nn.Module):
+    """On which spot a robot stands that turns there: the mean of what its pictures say.
+
+    One direction often looks like two places, and of a robot that hears another one with every
+    turn the advice turns it to and fro. Probabilities are averaged (a mixture), not multiplied:
+    pictures of one spot are anything but independent.
+
+    Args:
+        moves: [A,3] dx, dy [m], dyaw [rad] of the actions.
+        spots: how many there are, K.
+
+    Attributes:
+        width: K + 1 numbers to remember: the sum of the probabilities, and of how many pictures.
+    """
+
+    def __init__(self, moves: Sequence[Sequence[float]], spots: int):
+        super().__init__()
+        self.width = spots + 1
+        # The last row: no action yet.
+        stays = torch.tensor([*([dx == dy == 0.0] for dx, dy, _ in moves), [False]])
+        self.register_buffer('stays', stays, persistent=False)
+
+    @torch.no_grad()
+    def forward(self, here: Tensor, last_action: Tensor, starts: Tensor, before: Tensor
+                ) -> tuple[Tensor, Tensor]:
+        """Go through T steps.
+
+        Args:
+            here: [T,B,K+16] probabilities of the pictures.
+            last_action: [T,B], -1 where there is none; starts: [T,B] bool.
+            before: [B,K+1] remembered from before the first row.
+
+        Returns:
+            [T,B,K+16], spots averaged and headings as they are, and what is remembered after the
+            last row.
+        """
+        keep = (self.stays[last_action] & ~starts.unsqueeze(2)).to(before.dtype)
+        spots = here[..., :self.width - 1].to(before.dtype)
+        rows = []
+        for t in range(len(here)):
+            new = torch.cat([spots[t], torch.ones_like(spots[t, :, :1])], dim=1)
+            before = keep[t] * before + new
+            rows.append(before[:, :-1] / before[:, -1:])
+        return torch.cat([torch.stack(rows).to(here.dtype), here[..., self.width - 1:]],
+                         dim=2), before
 
 
 class Routes(nn.Module):
