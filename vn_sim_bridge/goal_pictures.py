@@ -10,14 +10,13 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from vn_msgs_py.images import ImageError, decode_rgb
 from vn_nav.errors import UserError
+from vn_nav.goal_picture import read_goal_picture
 
 INDEX = 'goals.json'
 
@@ -56,8 +55,8 @@ def load_goal_pictures(folder: str | Path) -> list[GoalPicture]:
                         remedy) from error
     if not (isinstance(entries, list) and entries and all(map(_is_entry, entries))):
         raise UserError(f'{INDEX} lists pictures and their poses', str(path), remedy)
-    return [GoalPicture(_read(path.parent / entry['picture']), tuple(map(float, entry['pose'])))
-            for entry in entries]
+    return [GoalPicture(read_goal_picture(path.parent / entry['picture']),
+                        tuple(map(float, entry['pose']))) for entry in entries]
 
 
 def _is_entry(entry) -> bool:
@@ -65,11 +64,3 @@ def _is_entry(entry) -> bool:
             and isinstance(entry.get('pose'), list) and len(entry['pose']) == 3
             and all(isinstance(value, (int, float)) and math.isfinite(value)
                     for value in entry['pose']))
-
-
-def _read(path: Path) -> np.ndarray:
-    try:
-        return decode_rgb(SimpleNamespace(format=path.suffix, data=path.read_bytes()))
-    except (OSError, ImageError) as error:
-        raise UserError('a goal picture is a JPEG or PNG file', f'{path}: {error}',
-                        'correct goals.json, or convert the picture') from error

@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
-from vn_msgs_py.images import ImageError, decode_rgb
 from vn_nav.bags.compare_drives import (
     ARRIVED,
     as_json,
@@ -22,6 +20,7 @@ from vn_nav.bags.compare_drives import (
 from vn_nav.bags.drive import Topics
 from vn_nav.bags.shadow_plan import Plan, make_plan
 from vn_nav.errors import UserError
+from vn_nav.goal_picture import read_goal_picture
 from vn_nav.nodes.isolation import stay_on_this_host
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint, write_file
 from vn_nav.robot import RobotSpec, load_robot
@@ -50,7 +49,7 @@ def run(bag: Path, checkpoint: Path, out: Path, *, other: Path | None, robot: Pa
     folders = [checkpoint] if other is None else [checkpoint, other]
     policies = [load_checkpoint(folder) for folder in folders]
     spec = _robot(load_robot(robot) if robot else RobotSpec(), policies)
-    picture = None if goal is None else _read_picture(goal)
+    picture = None if goal is None else read_goal_picture(goal)
     if out.exists():
         raise UserError('what is recorded has a folder of its own', str(out),
                         'choose another --out, or remove it')
@@ -96,14 +95,6 @@ def _robot(robot: RobotSpec, policies: list[LoadedCheckpoint]) -> RobotSpec:
     robot = robot.with_actions(first.config.actions, first.config.moves)
     widest = max(policy.info['camera_fov_deg'] for policy in policies)
     return dataclasses.replace(robot, camera_fov=math.radians(widest))
-
-
-def _read_picture(path: Path) -> np.ndarray:
-    try:
-        return decode_rgb(SimpleNamespace(format=path.suffix, data=path.read_bytes()))
-    except (OSError, ImageError) as error:
-        raise UserError('the goal is a JPEG or PNG picture', f'{path}: {error}',
-                        'give another one') from error
 
 
 def _words(plan: Plan) -> str:

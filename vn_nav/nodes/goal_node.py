@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
-from vn_msgs_py.images import ImageError, decode_rgb, fill_image
+from vn_msgs_py.images import fill_image
 from vn_nav.errors import UserError
+from vn_nav.goal_picture import read_goal_picture
 from vn_nav.nodes.process import run_node, spin
 from vn_nav.nodes.qos import qos
 
@@ -31,11 +31,7 @@ class GoalNode(Node):
         if not path.is_file():
             raise UserError('the goal is a picture file', str(path),
                             'give one with --ros-args -p picture:=kitchen.jpg')
-        try:
-            picture = decode_rgb(SimpleNamespace(format=path.suffix, data=path.read_bytes()))
-        except ImageError as error:
-            raise UserError('the goal is a JPEG or PNG picture', f'{path}: {error}',
-                            'convert it') from error
+        picture = read_goal_picture(path)
         self.publisher = self.create_publisher(Image, 'goal_image', qos('goal_image'))
         message = fill_image(Image(), picture, 'rgb8')
         message.header.stamp = self.get_clock().now().to_msg()
