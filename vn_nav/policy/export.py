@@ -21,8 +21,8 @@ that its network uses:
 | `arrival` | float32 [1] | logit: the robot stands where the goal was taken |
 | `next_hidden`, `next_cell` | | the memory, to pass next time |
 
-What contacts teach (`vn_nav.policy.contacts`) is not in the files: of a policy that knows its
-moves add it to the logits.
+What is kept in mind of the spot (`vn_nav.policy.spot`) is not in the files: with a policy that
+knows its moves add it to the logits.
 
 The metadata of both files are strings: `action_names` (JSON, in the order of the logits), `size`
 (S), `camera_fov_deg`, `camera_height` [m], `decoding` (sample or greedy), `stop_threshold`

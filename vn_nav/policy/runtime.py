@@ -11,9 +11,9 @@ import torch
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import DECODINGS, load_checkpoint
-from vn_nav.policy.contacts import ContactMemory
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
+from vn_nav.policy.spot import SpotMemory
 from vn_nav.policy.zhu import check_scenes
 
 
@@ -74,7 +74,7 @@ class PolicyRuntime:
         self._generator = torch.Generator().manual_seed(seed)
         self._goal_maps: torch.Tensor | None = None
         self._reward = torch.zeros(1, 1)  # a robot gets none
-        self._contacts = ContactMemory(self.moves, 1) if self.moves else None
+        self._spot = SpotMemory(self.moves, 1) if self.moves else None
         self.reset()
 
     @torch.inference_mode()
@@ -122,8 +122,8 @@ class PolicyRuntime:
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
         logits = output.logits[0]
-        if self._contacts is not None:
-            logits = logits + self._contacts.advise(picture, last, starts[0])
+        if self._spot is not None:
+            logits = logits + self._spot.advise(picture, last, starts[0])
         action = int(choose(logits, self.decoding, self._generator))
         if output.arrival is not None:
             arrival = float(torch.sigmoid(output.arrival[0, 0]))
@@ -156,7 +156,7 @@ class BatchedPolicy:
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
             the observation that `act` saw last; nan where the network has no such head.
-        logits: [N,A] tensor, of the actions at that observation, with what contacts have taught;
+        logits: [N,A] tensor, of the actions at that observation, with what is in mind of the spot;
             None before the first.
     """
 
@@ -170,7 +170,7 @@ class BatchedPolicy:
         self._goals: np.ndarray | None = None
         self._goal_maps = GoalMaps(network)
         moves = network.config.moves
-        self._contacts = ContactMemory(moves, num_envs) if moves else None
+        self._spot = SpotMemory(moves, num_envs) if moves else None
 
     @torch.inference_mode()
     def act(self, obs: dict[str, np.ndarray], goals: np.ndarray, reset_mask: np.ndarray,
@@ -204,8 +204,8 @@ class BatchedPolicy:
         if output.arrival is not None:
             self.arrival = torch.sigmoid(output.arrival[0]).numpy()
         self.logits = output.logits[0]
-        if self._contacts is not None:
-            self.logits = self.logits + self._contacts.advise(
+        if self._spot is not None:
+            self.logits = self.logits + self._spot.advise(
                 observation.image[0], observation.last_action[0], starts[0])
         return choose(self.logits, self.decoding, self._generator).numpy()
 

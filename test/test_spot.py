@@ -1,4 +1,4 @@
-"""A move that has led nowhere is not tried again from the same spot."""
+"""A move that has led nowhere is not tried again from the same spot, and turning has an end."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from vn_nav.policy.contacts import AGAIN, BACK, ContactMemory
+from vn_nav.policy.spot import AGAIN, BACK, RESTLESS, SEEN, SpotMemory
 
 TURN = math.radians(30)
 MOVES = ((0.5, 0, 0), (-0.2, 0, 0), (0, 0, TURN), (0, 0, -TURN))
@@ -19,7 +19,7 @@ class Walker:
 
     def __init__(self, moves=MOVES, seed=0):
         self.random = np.random.default_rng(seed)
-        self.memory = ContactMemory(moves, 1)
+        self.memory = SpotMemory(moves, 1)
         self.scene = self._draw()
 
     def _draw(self):
@@ -54,8 +54,17 @@ def test_what_led_nowhere_is_not_done_again_nor_faced_again(stuck):
 def test_all_around_comes_back_to_the_wall(stuck):
     for _ in range(11):
         said = stuck.sees(LEFT)
-    assert said == [0, 0, -BACK, 0]
-    assert stuck.sees(LEFT) == [-AGAIN, 0, 0, 0]
+    assert said[1:] == [0, -BACK, 0]
+    assert stuck.sees(LEFT) == pytest.approx([-AGAIN + (2 * math.pi - SEEN) / RESTLESS, 0, 0, 0])
+
+
+def test_who_turns_to_and_fro_drives_on_at_last():
+    walker = Walker()
+    walker.sees(-1, YES)
+    said = [walker.sees((LEFT, RIGHT)[k % 2])[FORWARD] for k in range(12)]
+    assert said == pytest.approx([max(k * TURN - SEEN, 0) / RESTLESS for k in range(1, 13)])
+    assert said[6] == 0 < said[8] < said[-1]
+    assert walker.sees(FORWARD) == [0, 0, 0, 0]
 
 
 def test_who_has_moved_on_is_free(stuck):
@@ -76,7 +85,7 @@ def test_a_turn_that_shows_the_same_is_no_contact():
 
 
 def test_robots_have_memories_of_their_own():
-    memory = ContactMemory(MOVES, 3)
+    memory = SpotMemory(MOVES, 3)
     pictures = torch.randint(0, 256, (3, 3, 64, 64), dtype=torch.uint8)
     pictures[:, :, :32] //= 4  # so that another picture differs, averaged, too
     memory.advise(pictures, torch.tensor([-1, -1, -1]), torch.ones(3, dtype=torch.bool))
