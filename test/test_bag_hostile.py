@@ -202,6 +202,7 @@ def attempt(name, path, folder, thorough, found):
         found['other'].append(f'{name}: {seconds:.1f} s')
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(max(240, MUTATIONS // 10))
 def test_no_mutated_bag_escapes_the_one_error(tmp_path):
     environment = {**os.environ, 'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}

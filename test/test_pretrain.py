@@ -79,6 +79,7 @@ def test_actions_and_poses_are_learned_and_hold_on_other_episodes(tmp_path):
     assert learned['overlap_accuracy'] > guess['overlap_accuracy'] + 0.1
 
 
+@pytest.mark.slow
 def test_image_heads_learn_depth_and_classes_of_picture_and_goal(tmp_path):
     drives = Drives([drive_set(60)], ROBOT)
     heads, rows = ('depth', 'segmentation', 'goal_segmentation', 'reconstruction'), []

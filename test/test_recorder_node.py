@@ -79,6 +79,7 @@ def test_a_late_recorder_gets_the_history_and_drops_nothing(talker, tmp_path):
     assert '/reward: 1500 received, 1500 written, 0 lost' in (tmp_path / 'log').read_text()
 
 
+@pytest.mark.slow
 def test_what_is_lost_is_counted(talker, tmp_path):
     """A recorder that stands still while more is published than anybody keeps for it."""
     publisher = talker.create_publisher(Odometry, 'odom', qos('odom'))
@@ -107,6 +108,7 @@ def test_what_is_lost_is_counted(talker, tmp_path):
     assert received + lost == 1600 and lost > 500
 
 
+@pytest.mark.slow
 def test_a_killed_recorder_loses_one_chunk_at_most(talker, tmp_path):
     """SIGKILL at three moments while 1 MB a second flows: 13 messages are a chunk."""
     publisher = talker.create_publisher(String, 'scene', QoSProfile(
@@ -241,6 +243,7 @@ def test_every_recorder_ends_when_it_is_asked_to(tmp_path, number):
     assert all((tmp_path / f'bag{k}' / 'metadata.yaml').is_file() for k in range(8))
 
 
+@pytest.mark.slow
 def test_a_signal_at_any_moment_is_not_a_deadlock(tmp_path):
     """Thousands of signals, from another process: one's own holds the interpreter's lock."""
     script = tmp_path / 'look.py'

@@ -43,6 +43,7 @@ KILLED = {
 TIMES = ('minutes', 'fps', 'collect_seconds', 'update_seconds')  # columns that no two runs share
 QUICK = TrainConfig(frames=800, rollout_length=16, channels=(8, 8, 8), features=24, hidden=16,
                     minibatches=1, epochs=1, bf16=False, checkpoint_seconds=0.001)
+pytestmark = pytest.mark.slow  # faults
 
 
 @pytest.fixture(autouse=True)
@@ -110,7 +111,6 @@ def kill_at_random(preset_name, folder, frames, chance, output):
     return committed, words
 
 
-@pytest.mark.slow  # four to five seconds a kill
 @pytest.mark.timeout(120 * KILLS)
 @pytest.mark.parametrize('name', list(KILLED))
 def test_a_killed_training_loses_no_committed_update(name, tmp_path):
@@ -272,7 +272,6 @@ cp -a "$1/disk/run" "$1/finished"
 """
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_a_full_disk_ends_a_training_in_one_line_and_room_lets_it_finish(tmp_path):
     # With the first process of its own process namespace all others end.
