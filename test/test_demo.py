@@ -49,7 +49,9 @@ def counted(folder):
         decisions = sum(stamp < s < until + 3e6 for s, _ in rewards) - sum(
             stamp < s < stamp + 3e6 for s, _ in rewards)
         collisions = sum(v for s, v in touches if stamp + 3e6 < s < until + 3e6)
-        success = [v for s, v in ends if stamp + 3e6 < s < until + 3e6] == [1]
+        # A stop elsewhere terminates an episode as well, without a reward.
+        gained = sum(v for s, v in rewards if stamp + 3e6 < s < until + 3e6)
+        success = [v for s, v in ends if stamp + 3e6 < s < until + 3e6] == [1] and gained > 0
         shortest = max(facts['start_distance'] - 0.6, 0)
         yield facts['max_decisions'], success, decisions, collisions, (
             success * shortest / max(path, shortest, 1e-9))
