@@ -42,7 +42,7 @@ from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.motion import fill_twist, odometry_to_array
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS, arrived, wrap_angle
 from vn_nav.bags.reader import read_bag
-from vn_nav.cli import machine
+from vn_nav.cli_world import machine
 from vn_nav.demo import LINE, Processes, ProcessFailure
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag

@@ -26,6 +26,11 @@ def run(*words):
     (['evaluate', 'models/house', '--split', 'test', '--house', '3'], 'by seed or by split'),
     (['evaluate', 'models/house', '--stop-threshold', '1'], 'threshold'),
     (['evaluate', 'models/house', '--html', 'OUT/page.html'], 'folder'),
+    (['evaluate', 'models/house', '--bag', '/nowhere'], 'a recording'),
+    (['evaluate', 'models/house', '--bag', 'bags/house_drive', '--rooms', '5'], '--rooms'),
+    (['evaluate', 'models/house', '--bag', 'bags/house_drive', '--split', 'test'], 'seen_goals'),
+    (['evaluate', 'models/house', '--bag', 'bags/house_drive', '--goals', '1'], 'four goals'),
+    (['evaluate', 'models/house', '--margin', '0.2'], 'give --bag'),
     (['compare', '/nowhere', '--out', 'OUT'], '.html'),
     (['train', '--backend', 'thor', '--out', 'OUT'], 'backend'),
     (['train', '--rooms', '99', '--out', 'OUT'], 'rooms'),
@@ -74,6 +79,18 @@ def test_evaluate_prints_figures(tmp_path, capsys):
     rows = result['splits']['seen_goals']['rows']['arrival']
     assert len(rows) == 6 and all(row['episodes'] == 6 for row in rows.values())
     assert page.read_text().count('<svg') == 6
+
+
+def test_a_policy_of_recorded_pictures_is_measured_in_houses_that_are_named(tmp_path, capsys):
+    folder = write_checkpoint(tmp_path / 'model', size=36)
+    config = json.loads((folder / CONFIG).read_text())
+    config |= {'world_version': 'recorded', 'houses': [], 'rooms': None}
+    (folder / CONFIG).write_text(json.dumps(config))
+    words = ['evaluate', str(folder), '--house', '7', '--episodes', '1', '--max-decisions', '2',
+             '--no-controls']
+    assert main(words) == 2 and '--rooms' in capsys.readouterr().err
+    assert main([*words, '--rooms', '1']) == 0
+    assert main(['evaluate', str(folder), '--rooms', '1']) == 2
 
 
 def test_evaluate_by_split_and_house(tmp_path, capsys):

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from ros_harness import write_checkpoint
 from small_bags import (
     IMAGE,
     INFO,
@@ -27,7 +28,7 @@ from vn_nav.errors import UserError
 from vn_nav.learning.presets import preset
 from vn_nav.learning.teach import OWN
 from vn_nav.learning.trainer import train
-from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.houses.procedural import generate_house
@@ -156,6 +157,49 @@ def test_a_drive_that_leads_nowhere_is_one_line_and_code_2(driven, tmp_path, cap
     said = capsys.readouterr().err
     assert code == 2 and 'leads through a place' in said and said.count('\n') == 1
     assert not (tmp_path / 'out' / 'checkpoint').exists()
+
+
+@pytest.fixture(scope='module')
+def bag(driven, tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp('driven') / 'bag', *driven)
+
+
+def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, capsys):
+    model = write_checkpoint(tmp_path / 'model', size=SIZE, arrival=0.1, stop_threshold=0.5)
+    figures, page = tmp_path / 'figures.json', tmp_path / 'page.html'
+    words = ['evaluate', str(model), '--bag', str(bag), '--cache', str(tmp_path / 'decoded'),
+             '--goals', '24', '--episodes', '8', '--max-decisions', '40', '--json', str(figures)]
+    assert main([*words, '--html', str(page)]) == 0
+    assert 'all goals of bag' in capsys.readouterr().out
+    result = json.loads(figures.read_text())
+    assert result['bag'] == 'bag' and list(result['splits']) == ['all_goals']
+    rows = result['splits']['all_goals']['rows']
+    assert list(rows) == ['arrival', 'declared']
+    assert all(row['episodes'] == 8 for own in rows.values() for row in own.values())
+    success = {name: row['success'] for name, row in rows['arrival'].items()}
+    assert success['shortest path'] > 0.8 > success['random actions']
+    shown = page.read_text()
+    assert shown.count('<svg') == 6 and 'House' not in shown and 'drive bag' in shown
+    # As `vn_nav teach` divides them: other goals, so other starts.
+    assert main([*words, '--split', 'seen_goals', '--split', 'unseen_goals', '--no-controls']) == 0
+    splits = json.loads(figures.read_text())['splits']
+    assert list(splits) == ['seen_goals', 'unseen_goals']
+    own, others = (split['rows']['arrival']['right goal, sample']['start_distance']
+                   for split in splits.values())
+    assert own != others
+
+
+@pytest.mark.parametrize(('known', 'code', 'says'), [
+    ({'world_version': '0'}, 2, 'world version'), ({'world_version': 'recorded'}, 0, ''),
+    ({'task': 'room'}, 2, 'its task is image'), ({'camera_fov_deg': 60.0}, 2, 'the camera')])
+def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, bag, tmp_path,
+                                                           capsys):
+    model = write_checkpoint(tmp_path / 'model', size=SIZE)
+    config = json.loads((model / CONFIG).read_text()) | known
+    (model / CONFIG).write_text(json.dumps(config))
+    assert main(['evaluate', str(model), '--bag', str(bag), '--goals', '8', '--episodes', '1',
+                 '--max-decisions', '2', '--no-controls', '--no-straighten']) == code
+    assert says in capsys.readouterr().err
 
 
 def test_the_robot_needs_the_actions_of_the_checkpoint(driven, tmp_path, capsys):

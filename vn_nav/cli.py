@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import datetime
 import math
-import os
-import platform
 import shlex
 import sys
 import time
@@ -14,15 +12,10 @@ from pathlib import Path
 
 from vn_nav import __version__
 from vn_nav.bags.command import add_bag_commands
+from vn_nav.cli_evaluate import run_evaluate, run_publish
+from vn_nav.cli_world import add_world, check_backend, load_for_house, machine, make_env
 from vn_nav.errors import UserError
-from vn_nav.evaluation.command import (
-    SPLIT_HOUSES,
-    add_compare_options,
-    add_evaluate_options,
-    check_evaluate_options,
-    evaluate,
-    run_compare,
-)
+from vn_nav.evaluation.command import add_compare_options, add_evaluate_options, run_compare
 from vn_nav.learning.command import (
     add_train_options,
     check_train_options,
@@ -32,10 +25,6 @@ from vn_nav.learning.command import (
 )
 from vn_nav.learning.pretrain_command import add_pretrain_options, run_pretrain
 from vn_nav.learning.teach import add_teach_options, teach
-
-BACKENDS = ('house',)
-STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
-UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -54,13 +43,13 @@ def build_parser() -> argparse.ArgumentParser:
     demo.set_defaults(run=run_demo)
 
     train = commands.add_parser('train', help='train a policy')
-    _add_world(train)
+    add_world(train)
     add_train_options(train)
     train.set_defaults(run=run_train)
 
     collected = commands.add_parser(
         'collect', help='record pictures from random poses as a bag, for pre-training')
-    _add_world(collected)
+    add_world(collected)
     collected.add_argument('--houses', type=int, metavar='N', help='the first N training houses')
     collected.add_argument('--pictures', type=int, default=20_000,
                            help='in all (thesis, 5.7: 20,000)')
@@ -80,7 +69,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     measured = commands.add_parser('evaluate', help='measure a checkpoint')
     measured.add_argument('checkpoint', type=Path)
-    _add_world(measured, defaults=False)
+    add_world(measured, defaults=False)
     add_evaluate_options(measured)
     measured.set_defaults(run=run_evaluate)
 
@@ -124,61 +113,9 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_world(parser: argparse.ArgumentParser, defaults: bool = True) -> None:
-    parser.add_argument('--backend', default='house', help=f'one of: {", ".join(BACKENDS)}')
-    parser.add_argument('--house', type=int, action='append', metavar='SEED',
-                        help='seed of a house; may be given several times')
-    parser.add_argument('--rooms', type=int, default=5 if defaults else None)
-    parser.add_argument('--robot', type=Path, metavar='YAML',
-                        help='robot file (config/robots/); default: the standard robot')
-    parser.add_argument('--randomisation', default='none' if defaults else None, metavar='NAME',
-                        help='of light, camera and base: none, standard, rough or a YAML file')
-    parser.add_argument('--seed', type=int, default=0 if defaults else 10_000)
-
-
-def _check_backend(name: str) -> None:
-    if name not in BACKENDS:
-        raise UserError(f'the backend is one of: {", ".join(BACKENDS)}', name, 'choose one')
-
-
-def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, threads: int = 1,
-             randomisation: str | Path = 'none', device: str = 'cpu', **options):
-    """A `NavigationEnv` of embedded houses; without a robot file with the standard robot.
-
-    On a device other than the CPU it is a `WarpNavigationEnv`.
-    """
-    from vn_nav.robot import load_robot
-    from vn_sim_bridge.env import EnvConfig, NavigationEnv
-    from vn_sim_bridge.randomisation import load_randomisation
-    config = EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs,
-                       randomisation=load_randomisation(randomisation), **options)
-    spec = load_robot(robot) if robot else None
-    if device == 'cpu':
-        return NavigationEnv(config, spec, threads=threads)
-    _check_gpu(device)
-    from vn_sim_bridge.warp_env import WarpNavigationEnv
-    return WarpNavigationEnv(config, spec, device=device)
-
-
-def _check_gpu(device: str) -> None:
-    """Whether the simulator can run on a GPU such as cuda:0."""
-    import torch
-    try:
-        import warp as wp
-    except ImportError as error:
-        raise UserError('the simulator runs on a GPU with the extra "gpu"', str(error),
-                        "pip install 'vn_nav[gpu]', or use --device cpu") from error
-    number = torch.device(device).index or 0
-    known = min(torch.cuda.device_count(), wp.get_cuda_device_count())
-    if number >= known:
-        raise UserError('the device is a GPU that torch and Warp find', f'{device}; they find '
-                        f'{known or "none"}', 'look at nvidia-smi and at torch.version.cuda, or '
-                        'use --device cpu')
-
-
 def run_collect(args) -> int:
     """`vn_nav collect`."""
-    _check_backend(args.backend)
+    check_backend(args.backend)
     from vn_nav.bags.recorder import BagWriter
     from vn_nav.robot import RobotSpec, load_robot
     from vn_sim_bridge.collect import collect, house_scenes
@@ -203,7 +140,7 @@ def run_collect(args) -> int:
 
 def run_train(args) -> int:
     """`vn_nav train`."""
-    _check_backend(args.backend)
+    check_backend(args.backend)
     check_train_options(args)
     if args.env == 'ros':
         return _train_over_ros(args)
@@ -323,165 +260,6 @@ def run_teach(args) -> int:
     return teach(args, place)
 
 
-def machine(device: str = 'cpu') -> str:
-    """The processor in words, or the GPU."""
-    if device != 'cpu':
-        import torch
-        return torch.cuda.get_device_name(device)
-    try:
-        lines = Path('/proc/cpuinfo').read_text().splitlines()
-        model = next(line.split(':', 1)[1].strip() for line in lines if 'model name' in line)
-    except (OSError, StopIteration):
-        model = platform.processor() or platform.machine()
-    return f'{model}, {os.cpu_count()} cores'
-
-
-def _load(path: Path, robot: Path | None = None):
-    """A checkpoint for the present world, whose actions and camera the robot has."""
-    from vn_nav.policy.checkpoint import load_checkpoint
-    from vn_nav.robot import RobotSpec, load_robot
-    from vn_sim_bridge.world import WORLD_VERSION
-    checkpoint = load_checkpoint(path)
-    spec = load_robot(robot) if robot else RobotSpec()
-    # Or says which action is unknown, or too long.
-    spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
-    trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
-    present = math.degrees(spec.camera_fov), spec.camera_height
-    if any(abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
-        raise UserError('the robot has the camera that the policy was trained with: '
-                        f'{trained[0]:g} deg, {trained[1]:g} m high',
-                        f'{present[0]:g} deg, {present[1]:g} m (robot {spec.name})',
-                        'give its file with --robot, or train a policy for this robot')
-    if checkpoint.info['world_version'] != WORLD_VERSION:
-        raise UserError(f'the checkpoint belongs to world version {WORLD_VERSION!r}',
-                        checkpoint.info['world_version'], 'train it again (vn_nav train), or use '
-                        'the version of vn_nav that it came with')
-    return checkpoint
-
-
-def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, controls: bool = True,
-            decoding: str | None = None, threshold: float | None = None, max_decisions: int = 300,
-            robot: Path | None = None, randomisation: str | None = None, goal_seed: int = 0):
-    """Episodes of a loaded checkpoint in some houses.
-
-    Returns:
-        The episodes as `evaluator.measure` returns them, and the houses' floor plans by seed.
-    """
-    from vn_nav.evaluation import evaluator
-    from vn_nav.robot import load_robot
-    info, plans = checkpoint.info, {}
-    own = set(houses) <= set(info['houses'])
-
-    def make(seeds, environments: int, stop: str):
-        env = make_env(seeds, rooms, environments, robot=robot, size=checkpoint.config.size,
-                       randomisation=randomisation or info['randomisation'], task=info['task'],
-                       objects=info['objects'], actions=checkpoint.config.actions,
-                       max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
-                       goals_per_room=info['goals_per_room'] if own else 1)
-        plans.update({house.seed: house.floor_plan() for house in env.houses})
-        return env
-
-    wanted = evaluator.CONTROLS if controls else ()
-    if info['task'] == 'collect':  # no goal: none to show wrong, and no shortest path to it
-        wanted = [name for name in wanted if name in (evaluator.OTHER, evaluator.RANDOM)]
-    rows = evaluator.measure(
-        make, checkpoint.network, houses, known=info['houses'],
-        decoding=decoding or info['decoding'],
-        episodes=episodes, controls=wanted, seed=seed,
-        threshold=info.get('stop_threshold') if threshold is None else threshold,
-        robot=load_robot(robot) if robot else None)
-    return rows, plans
-
-
-def _splits(args, info: dict) -> dict[str, list[int]]:
-    """The houses of each split that is asked for."""
-    from vn_sim_bridge.houses.splits import SPLITS
-    if args.house:
-        return {'houses': list(dict.fromkeys(args.house))}
-    found = {}
-    for name in args.split or ['seen_goals']:
-        if name in ('seen_goals', 'unseen_goals'):
-            found[name] = info['houses'][:args.houses]
-            if not found[name]:
-                raise UserError('seen and unseen goals are in the houses of the checkpoint',
-                                'a checkpoint that names none', 'give --house or another --split')
-        elif name in SPLITS:
-            found[name] = list(SPLITS[name][:args.houses or SPLIT_HOUSES])
-            known = sorted(set(found[name]) & set(info['houses']))
-            if name != 'train' and known:
-                raise UserError(f'the checkpoint was not trained in houses of split {name}',
-                                f'house {known[0]}', 'choose another split')
-        else:
-            raise UserError(f'a split is one of {", ".join(SPLITS)}, seen_goals, unseen_goals',
-                            name, 'choose one of them')
-    return found
-
-
-def run_evaluate(args) -> int:
-    """`vn_nav evaluate`."""
-    _check_backend(args.backend)
-    check_evaluate_options(args)
-    checkpoint = _load(args.checkpoint, args.robot)
-
-    def measure_split(name: str, houses):
-        return measure(
-            checkpoint, houses, args.rooms or checkpoint.info['rooms'], episodes=args.episodes,
-            seed=args.seed, controls=not args.no_controls, decoding=args.decoding,
-            threshold=args.stop_threshold, max_decisions=args.max_decisions, robot=args.robot,
-            randomisation=args.randomisation,
-            goal_seed=UNSEEN_GOALS if name == 'unseen_goals' else 0)
-
-    evaluate(args, checkpoint.info, _splits(args, checkpoint.info), measure_split)
-    return 0
-
-
-def run_publish(args) -> int:
-    """`vn_nav publish`."""
-    from vn_nav.evaluation import evaluator, tables
-    from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
-    checkpoint = _load(args.source, args.robot)
-    info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
-    save_checkpoint(args.target, checkpoint.network, info, half=True)
-    shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
-    houses, rooms = info['houses'], info['rooms']
-    if 'arrival' in shipped.config.heads:
-        info['stop_threshold'] = _stop_threshold(shipped, args)
-        save_checkpoint(args.target, shipped.network, info, half=True)
-        shipped = load_checkpoint(args.target)
-    info['results'] = {}
-    for place, seeds in (('trained house', houses), (f'unseen house {args.unseen}',
-                                                     [args.unseen])):
-        rows, _ = measure(shipped, seeds, rooms, episodes=args.episodes, seed=10_000,
-                          robot=args.robot)
-        results = evaluator.figures(rows)
-        tables.print_rows(results, place)
-        for stop, row in results.items():
-            kind = '' if stop == evaluator.ARRIVAL else 'declared stop, '
-            info['results'] |= {f'{place}: {kind}{name}': figures
-                                for name, figures in row.items()}
-    info['notes'] += (f' Measured with `vn_nav publish`, {args.episodes} episodes a row, 300 '
-                      f'decisions at most, motion noise on, on {machine()}, '
-                      f'{datetime.date.today().isoformat()}. Figures are defined in '
-                      'docs/architecture.md.')
-    save_checkpoint(args.target, shipped.network, info, half=True)
-    return 0
-
-
-def _stop_threshold(checkpoint, args) -> float:
-    """The probability of arrival that is best declared at, on starts that no figure is from."""
-    from vn_nav.evaluation import evaluator
-    success = {}
-    for threshold in STOP_THRESHOLDS:
-        rows, _ = measure(checkpoint, checkpoint.info['houses'][:16], checkpoint.info['rooms'],
-                          episodes=args.episodes, seed=20_000, controls=False,
-                          threshold=threshold, robot=args.robot)
-        (row,) = evaluator.figures(rows)[evaluator.DECLARED].values()
-        success[threshold] = row['success']
-        print(f'declaring above {threshold:.0%}: success {row["success"]:.2f}, false stops '
-              f'{row["false_stops"]:.2f}', flush=True)
-    return max(success, key=success.get)
-
-
 def run_export(args) -> int:
     """`vn_nav export`."""
     from vn_nav.policy.checkpoint import load_checkpoint
@@ -496,7 +274,7 @@ def run_demo(args) -> int:
     from vn_nav.demo import run
     from vn_nav.resources import share_file
     folder = args.checkpoint or share_file('models/house')
-    task = _load(folder).info['task']  # refuse before anything is written
+    task = load_for_house(folder)[0].info['task']  # refuse before anything is written
     if task != 'image':
         raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
                         task, 'use vn_nav evaluate')

@@ -14,9 +14,9 @@ from vn_sim_bridge.env import PRIVILEGED, EnvConfig, NavigationEnv
 from vn_sim_bridge.graph_pairs import GraphPairs
 from vn_sim_bridge.graph_views import GraphViews
 from vn_sim_bridge.houses.house import CELL
-from vn_sim_bridge.image_graph import MARGIN, ImageGraph, build_graph
+from vn_sim_bridge.image_graph import ImageGraph, build_graph
 
-__all__ = ['MARGIN', 'build_graph', 'draw_map', 'held_out', 'make_env', 'make_pairs', 'make_views',
+__all__ = ['build_graph', 'draw_map', 'held_out', 'make_env', 'make_pairs', 'make_views',
            'regrets']
 
 SHARE, LEAST = 10, 2  # one goal in so many is held out, and at least so many are

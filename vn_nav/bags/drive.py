@@ -34,6 +34,7 @@ JUMP = 0.3  # m that odometry may be corrected by between two pictures
 MISFIT = -1  # in place of an action
 MIXED = 0.5  # share of an action that a motion may do along another axis beside it
 COARSE = 0.35  # share of an action that may be missing or too much at its end
+RECORDED = 'recorded'  # world version of pictures from no simulator, or from several
 
 
 @dataclasses.dataclass(frozen=True)

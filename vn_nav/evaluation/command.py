@@ -8,8 +8,15 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from vn_nav.bags.recorded_place import (
+    add_place_options,
+    check_place_options,
+    given_place_options,
+)
 from vn_nav.errors import UserError
 
+OF_HOUSES = ('house', 'houses', 'rooms', 'randomisation')  # options without meaning in a bag
+DRIVE_SPLITS = ('seen_goals', 'unseen_goals')
 SPLIT_HOUSES = 20  # of a split that the checkpoint does not know, unless told otherwise
 
 
@@ -18,7 +25,11 @@ def add_evaluate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--split', action='append', metavar='NAME',
                         help='train, validation, test, unseen_look (other houses), seen_goals or '
                         "unseen_goals (in the checkpoint's own houses; the first of the two is "
-                        'the default); may be given several times')
+                        'the default); may be given several times. In a bag: seen_goals, '
+                        'unseen_goals, as `vn_nav teach` divides them; default: all')
+    parser.add_argument('--bag', type=Path, metavar='BAG', help='measure in the pictures of this '
+                        'recorded drive, as `vn_nav teach` makes a place of it, not in houses')
+    add_place_options(parser)
     parser.add_argument('--houses', type=int, metavar='N', help='the first N houses of each split '
                         f'(default: all of its own, {SPLIT_HOUSES} others)')
     parser.add_argument('--episodes', type=int, default=100,
@@ -68,7 +79,25 @@ def check_evaluate_options(args) -> None:
     for kept, rule, received, remedy in rules:
         if not kept:
             raise UserError(rule, received, remedy)
+    if args.bag is not None:
+        _check_drive(args)
+    elif given := given_place_options(args):
+        raise UserError('pictures with poses are made a place in a recorded drive',
+                        f'{", ".join(given)} without --bag', 'give --bag')
     _check_folders(args.json, args.html)
+
+
+def _check_drive(args) -> None:
+    """Whether the options are for a recorded drive."""
+    check_place_options(args)
+    for name in OF_HOUSES:
+        if getattr(args, name) is not None:
+            raise UserError('a recorded drive has pictures and a size of its own',
+                            f'--{name} together with --bag', 'leave one of them out')
+    for name in args.split or ():
+        if name not in DRIVE_SPLITS:
+            raise UserError(f'goals of a drive are divided into {" and ".join(DRIVE_SPLITS)}',
+                            name, 'choose one of them, or leave out --split')
 
 
 def _check_folders(*files: Path | None) -> None:
@@ -92,6 +121,7 @@ def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) 
     from vn_nav.policy.checkpoint import write_file
     result = {
         'checkpoint': str(args.checkpoint), 'sha256': info['sha256'],
+        'bag': args.bag.name if args.bag else None,
         'world_version': info['world_version'], 'task': info['task'],
         'decoding': args.decoding or info['decoding'], 'max_decisions': args.max_decisions,
         'seed': args.seed, 'date': datetime.date.today().isoformat(), 'splits': {}}
@@ -102,10 +132,10 @@ def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) 
         result['splits'][name] = split = {
             'houses': houses, 'rows': evaluator.figures(measured[name]),
             'scenes': {str(seed): evaluator.figures(scenes[seed]) for seed in houses}}
-        title = (f'{args.checkpoint}, {tables.place(name, houses)}, '
+        title = (f'{args.checkpoint}, {tables.place(name, houses, result["bag"])}, '
                  f'{args.max_decisions} decisions at most')
         tables.print_rows(split['rows'], title)
-        if args.per_scene:
+        if args.per_scene and not args.bag:
             tables.print_scenes(split['scenes'], title)
     if args.json:
         write_file(args.json, json.dumps(result, indent=2).encode())

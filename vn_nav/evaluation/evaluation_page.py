@@ -42,7 +42,7 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
         plans: floor plans by split and the house's seed, see `floor_map`.
         maps: at most this many of each split.
     """
-    body = ''.join(_split(name, split, measured[name], plans[name], result['max_decisions'], maps)
+    body = ''.join(_split(name, split, measured[name], plans[name], result, maps)
                    for name, split in result['splits'].items())
     return page('vn_nav evaluate', f"""<h1>{html.escape(result['checkpoint'])}</h1>
 <p class="soft">World version {html.escape(str(result['world_version']))}, task
@@ -53,7 +53,7 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
 {WORDS}""")
 
 
-def _split(name: str, split: dict, rows: Rows, plans: dict[int, dict], limit: int,
+def _split(name: str, split: dict, rows: Rows, plans: dict[int, dict], result: dict,
            maps: int) -> str:
     # The headline is the declared stop, where the policy can declare one.
     headline = DECLARED if DECLARED in split['rows'] else ARRIVAL
@@ -61,18 +61,21 @@ def _split(name: str, split: dict, rows: Rows, plans: dict[int, dict], limit: in
                      for stop, own in split['rows'].items())
     scenes = ''.join(f'<h3>{TITLES[stop]}</h3>{scenes_html(split["scenes"], stop)}'
                      for stop in split['rows'])
-    houses = len(split['houses'])
+    bag, limit, houses = result.get('bag'), result['max_decisions'], len(split['houses'])
+    scenes = '' if bag else f'<details><summary>By house</summary>{scenes}</details>'
+    where = f'{houses} house{"s" * (houses > 1)}' if bag is None else (
+        f'In the pictures of the drive {html.escape(bag)}')
     own = next(iter(split['rows'][headline].values()))
     chosen = choose(next(iter(rows[headline].values())), maps)
-    figures = ''.join(_map(episode, plans[episode.scene], limit) for episode in chosen)
+    figures = ''.join(_map(episode, plans[episode.scene], limit, bag) for episode in chosen)
     legend = ('<p class="soft">Dot: start; ring: end; blue arrow: the goal and where its picture '
               'looks; crosses: contacts.</p>' if chosen else '')
     return f"""<h2>{html.escape(SPLITS.get(name, name))}</h2>
-<p class="soft">{houses} house{'s' * (houses > 1)}, {own['episodes']} episodes a row, mean start
+<p class="soft">{where}, {own['episodes']} episodes a row, mean start
 distance {own['start_distance']:.1f} m.</p>
 {_cards(split['rows'][headline], headline)}
 {tables}
-<details><summary>By house</summary>{scenes}</details>
+{scenes}
 {legend}<div class="maps">{figures}</div>"""
 
 
@@ -127,7 +130,7 @@ def outcome(episode: Episode) -> str:
     return 'passed its goal and never stopped' if episode.reached else 'gave up'
 
 
-def _map(episode: Episode, plan: dict, limit: int) -> str:
+def _map(episode: Episode, plan: dict, limit: int, bag: str | None) -> str:
     kind = 'yes' if episode.success else 'no'
     goals = [] if episode.goal_pose is None else [episode.goal_pose]
     drawn = floor_map(plan, [Journey(episode.trajectory, episode.success, episode.contacts)],
@@ -135,7 +138,8 @@ def _map(episode: Episode, plan: dict, limit: int) -> str:
     count = episode.decisions
     after = (f'after {count} decision{"s" * (count > 1)}' if count < limit
              else f'at the limit of {limit} decisions')
-    return f"""<figure>{drawn}<figcaption>House {episode.scene}, to the
+    to = 'To the' if bag else f'House {episode.scene}, to the'
+    return f"""<figure>{drawn}<figcaption>{to}
 {html.escape(episode.goal)}: <span class="{kind}">{outcome(episode)}</span> {after},
 {episode.path_length:.1f} m for a shortest way of {episode.start_distance:.1f} m; end
 {episode.stop_distance:.1f} m from the goal</figcaption></figure>"""

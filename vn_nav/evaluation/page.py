@@ -56,7 +56,7 @@ figure { margin:18px 0 } svg { width:100%; height:auto; max-height:640px; backgr
 table { border-collapse:collapse; font-size:.9rem; width:100%; font-variant-numeric:tabular-nums }
 th, td { text-align:right; padding:5px 8px; border-bottom:1px solid var(--line);
   vertical-align:bottom } th { font-weight:600 } .wide td { white-space:nowrap }
-.wide table { font-size:.85rem }
+.wide table { font-size:.85rem } .wide th, .wide td { padding:5px 6px }
 .text { text-align:left } tr.first td { font-weight:600 }
 summary { cursor:pointer; margin:14px 0 6px } dt { font-weight:600 } dd { margin:0 0 8px }
 """

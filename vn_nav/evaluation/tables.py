@@ -11,6 +11,7 @@ from vn_nav.evaluation.page import table
 TITLES = {'arrival': 'Arrival', 'declared': 'Declared stop'}
 SPLITS = {  # names of splits, for people
     'houses': 'Chosen houses', 'seen_goals': 'Seen goals', 'unseen_goals': 'Unseen goals',
+    'all_goals': 'All goals',
     'train': 'Training split', 'validation': 'Validation split', 'test': 'Test split',
     'unseen_look': 'Unseen look',
 }
@@ -33,8 +34,10 @@ STOP_COLUMNS: tuple[Column, ...] = (
 )
 
 
-def place(split: str, houses: Sequence[int]) -> str:
-    """A split and its houses in a few words."""
+def place(split: str, houses: Sequence[int], bag: str | None = None) -> str:
+    """A split and its houses, or the recorded drive, in a few words."""
+    if bag is not None:
+        return f'{SPLITS[split].lower()} of {bag}'
     if len(houses) <= 3:
         return f'{SPLITS[split].lower()} (house {", ".join(map(str, houses))})'
     return f'{SPLITS[split].lower()} ({len(houses)} houses)'

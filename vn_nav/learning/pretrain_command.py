@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 import shlex
 import sys
@@ -14,8 +13,8 @@ from pathlib import Path
 import torch
 
 from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import Topics, load_topics
-from vn_nav.bags.stream import messages
+from vn_nav.bags.drive import RECORDED, Topics, load_topics
+from vn_nav.bags.recorded_place import scene_of
 from vn_nav.errors import UserError
 from vn_nav.learning.command import CHANGES, train_config
 from vn_nav.learning.hindsight import Drives, split
@@ -28,7 +27,6 @@ from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
 
 RANDOM_POSES = 'random'  # the entry `poses` of the topic scene in bags of `vn_nav collect`
-RECORDED = 'recorded'  # world version of pictures from no simulator, or from several
 
 
 def add_pretrain_options(parser: argparse.ArgumentParser) -> None:
@@ -171,16 +169,6 @@ def _policy(network: NetworkConfig, parts: Sequence[str], given: LoadedCheckpoin
     if given is not None:
         policy.load_state_dict(policy.state_dict() | given.network.state_dict())
     return policy
-
-
-def scene_of(bag: Path) -> dict:
-    """What a simulator said of the scene of a bag; empty: nobody did."""
-    first = next(messages(bag, ('scene',)), None)
-    try:
-        said = json.loads(first.message.data) if first is not None else {}
-    except (AttributeError, TypeError, ValueError):  # another kind of scene
-        return {}
-    return said if isinstance(said, dict) else {}
 
 
 def _describe(bag: Path, drives: DriveSet, wanted: Wanted) -> str:

@@ -21,9 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import Topics, load_topics
-from vn_nav.bags.loops import straighten
+from vn_nav.bags.recorded_place import add_place_options, check_place_options, read_place
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator, tables
 from vn_nav.evaluation.evaluation_page import evaluation_page
@@ -31,7 +29,6 @@ from vn_nav.learning.command import CHANGES, train_config
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BANK, Views, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
-from vn_nav.learning.pretrain_command import RECORDED, scene_of
 from vn_nav.learning.trainer import CHECKPOINT, STATE, has_fast_bfloat16, train
 from vn_nav.policy.checkpoint import (
     LoadedCheckpoint,
@@ -57,7 +54,6 @@ ALONE = (0.4, 0.6)  # and where that is all: a policy that finds pictures anywhe
 OWN, ADVISED = 0.75, 0.9
 START = 'start'  # folder of the policy that knows the place, but no way there
 COLLISION_REWARD = -0.05  # of leaving what the pictures cover
-LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by
 CONTROLS = (evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST)
 BEFORE = 'before teaching'
 SPLITS = ('seen_goals', 'unseen_goals')
@@ -66,8 +62,6 @@ EVALUATION_SEED = 10_000
 
 class Place(Protocol):
     """What the simulator's half makes of a drive; `vn_sim_bridge.teach` is one."""
-
-    MARGIN: float  # m beside the driven path that count as free
 
     def build_graph(self, pictures, poses, episode, robot: RobotSpec, **options) -> Any:
         """A place out of pictures with poses."""
@@ -102,13 +96,7 @@ def add_teach_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--minutes', type=float, default=10.0, help='of learning')
     parser.add_argument('--robot', type=Path, metavar='YAML',
                         help='that drove, with its camera; default: the standard robot')
-    parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
-    parser.add_argument('--margin', type=float, metavar='M',
-                        help='beside the driven path that counts as free [m]; default 0.3')
-    parser.add_argument('--straighten', action=argparse.BooleanOptionalAction, default=True,
-                        help='correct odometry by the places that the drive shows twice '
-                        '(docs/bags.md)')
-    parser.add_argument('--goals', type=int, default=1000, help='pictures to drive to, at most')
+    add_place_options(parser)
     parser.add_argument('--places', type=int, default=PLACES, metavar='K', help='spots of the '
                         'place that the policy knows by heart; 0: none')
     parser.add_argument('--episodes', type=int, default=50, help='of each row of the evaluation')
@@ -119,8 +107,6 @@ def add_teach_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
                         help='any number of vn_nav.learning.presets.TrainConfig')
     parser.add_argument('--resume', action='store_true', help='go on with the run in --out')
-    parser.add_argument('--cache', type=Path, metavar='DIR',
-                        help='of decoded bags; default: OUT/decoded')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--threads', type=int, default=1, help='of torch')
 
@@ -133,11 +119,13 @@ def teach(args: argparse.Namespace, place: Place) -> int:
             spot.
     """
     _check(args)
+    check_place_options(args)
     given = load_checkpoint(args.checkpoint) if args.checkpoint else None
     config = _config(args, given)
     robot = _robot(args, given)
     size = given.config.size if given else args.size or 84
-    graph = _graph(args, place, robot, size)
+    graph = read_place(args, place.build_graph, robot, size,
+                       args.cache or args.out / 'decoded')
     own, others = place.held_out(graph)
     for line in (*graph.words, 'no goals are held out: there are too few' if others is None else
                  f'{len(own.goals)} goals to learn, {len(others.goals)} held out'):
@@ -167,7 +155,6 @@ def teach(args: argparse.Namespace, place: Place) -> int:
 def _check(args: argparse.Namespace) -> None:
     rules = (
         (args.minutes > 0, 'there is some time to learn', args.minutes, 'raise --minutes'),
-        (args.goals >= 4, 'there are at least four goals', args.goals, 'raise --goals'),
         (args.episodes >= 1, 'there is at least one episode', args.episodes, 'raise --episodes'),
         (args.places == 0 or 2 <= args.places <= 1024, 'there are 2 to 1024 spots, or none',
          args.places, 'correct --places'),
@@ -215,45 +202,6 @@ def _robot(args: argparse.Namespace, given: LoadedCheckpoint | None) -> RobotSpe
               f'has learned with ({before[0]:.0f} deg, {before[1]:g} m): it gets used to it',
               flush=True)
     return robot.with_actions(given.config.actions, given.config.moves)
-
-
-def _graph(args: argparse.Namespace, place: Place, robot: RobotSpec, size: int):
-    """The place out of the bag."""
-    topics = load_topics(args.topics) if args.topics else Topics()
-    cache = args.cache or args.out / 'decoded'
-    drives = load_drives(args.bag, Wanted(robot, size, topics, every=True), cache)
-    facts = drives.facts
-    print(f'{args.bag}: {len(drives):,} pictures with poses in {facts["episodes"]:,} '
-          f'stretch{"es" * (facts["episodes"] > 1)}; {facts["without_pose"]:,} without a pose, '
-          f'{facts["jumps"]:,} jumps', flush=True)
-    return place.build_graph(
-        drives.image, _poses(args, drives, robot, topics, cache), drives.episode, robot,
-        depth=drives.depth,
-        farthest=MAX_DEPTH, goals=args.goals, goal_pictures=drives.goals,
-        margin=place.MARGIN if args.margin is None else args.margin, seed=args.seed,
-        world_version=str(scene_of(args.bag).get('world_version', RECORDED)))
-
-
-def _poses(args: argparse.Namespace, drives: DriveSet, robot: RobotSpec, topics: Topics,
-           cache: Path) -> np.ndarray:
-    """Where the pictures were taken, [N,3]: by odometry, straightened unless that is not wanted.
-
-    Larger pictures than the network's tell more exactly.
-    """
-    if not args.straighten:
-        return drives.pose
-    large = drives
-    if drives.image.shape[-1] < LOOKED_AT:
-        large = load_drives(args.bag, Wanted(robot, LOOKED_AT, topics, every=True), cache)
-    found = straighten(large, robot)
-    facts = found.facts
-    if facts['corrected']:
-        print(f'odometry is straightened: {facts["closures"]:,} times the robot saw a place '
-              f'again; poses moved by up to {facts["moved"]:.2f} m and '
-              f'{math.degrees(facts["turned"]):.0f} deg', flush=True)
-    else:
-        print('odometry stays as it is: too few places are recognised when seen again', flush=True)
-    return found.poses
 
 
 def _learn_places(args: argparse.Namespace, place: Place, graph, robot: RobotSpec,
@@ -323,8 +271,9 @@ def _evaluate(args: argparse.Namespace, place: Place, folder: Path,
     taught = load_checkpoint(folder)
     threshold = (given.info['stop_threshold'] if given else None) or evaluator.STOP_THRESHOLD
     result = {
-        'checkpoint': str(folder), 'world_version': taught.info['world_version'],
-        'task': 'image', 'decoding': 'sample', 'seed': EVALUATION_SEED,
+        'checkpoint': str(folder), 'bag': args.bag.name,
+        'world_version': taught.info['world_version'], 'task': 'image',
+        'decoding': 'sample', 'seed': EVALUATION_SEED,
         'max_decisions': ENVIRONMENT[PRESET]['max_decisions'],
         'date': datetime.date.today().isoformat(), 'splits': {}}
     measured, plans = {}, {}

@@ -1,0 +1,107 @@
+"""A bag's drive as a place of pictures, as `vn_nav teach` and `vn_nav evaluate --bag` read it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
+from vn_nav.bags.drive import RECORDED, Topics, load_topics
+from vn_nav.bags.loops import straighten
+from vn_nav.bags.stream import messages
+from vn_nav.errors import UserError
+from vn_nav.robot import RobotSpec
+
+GOALS, LEAST_GOALS = 1000, 4
+LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by
+
+
+def add_place_options(parser: argparse.ArgumentParser) -> None:
+    """How pictures become a place."""
+    parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
+    parser.add_argument('--margin', type=float, metavar='M',
+                        help='beside the driven path that counts as free [m]; default 0.3')
+    parser.add_argument('--straighten', action=argparse.BooleanOptionalAction, default=True,
+                        help='correct odometry by the places that the drive shows twice '
+                        '(docs/bags.md)')
+    parser.add_argument('--goals', type=int, default=GOALS, help='pictures to drive to, at most')
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags')
+
+
+def given_place_options(args: argparse.Namespace) -> list[str]:
+    """Names of those that differ from their default."""
+    given = {'--topics': args.topics, '--margin': args.margin, '--cache': args.cache,
+             '--no-straighten': None if args.straighten else True,
+             '--goals': None if args.goals == GOALS else args.goals}
+    return [name for name, value in given.items() if value is not None]
+
+
+def check_place_options(args: argparse.Namespace) -> None:
+    """Refuse what no drive is a place with."""
+    if args.goals < LEAST_GOALS:
+        raise UserError('there are at least four goals', args.goals, 'raise --goals')
+
+
+def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec, size: int,
+               cache: Path) -> Any:
+    """The place out of a bag, and words about it on standard output.
+
+    Args:
+        args: `bag` and the options of `add_place_options`.
+        build_graph: of the simulator's half, `vn_sim_bridge.image_graph.build_graph`.
+        robot: that drove, with the policy's actions.
+        size: side of the pictures [pixels].
+        cache: folder of decoded bags.
+
+    Raises:
+        UserError: a bag without what is needed; a drive too short, or of one spot.
+    """
+    topics = load_topics(args.topics) if args.topics else Topics()
+    drives = load_drives(args.bag, Wanted(robot, size, topics, every=True), cache)
+    facts = drives.facts
+    print(f'{args.bag}: {len(drives):,} pictures with poses in {facts["episodes"]:,} '
+          f'stretch{"es" * (facts["episodes"] > 1)}; {facts["without_pose"]:,} without a pose, '
+          f'{facts["jumps"]:,} jumps', flush=True)
+    margin = {} if args.margin is None else {'margin': args.margin}
+    poses = _straightened(args.bag, drives, robot, topics, cache) if args.straighten else (
+        drives.pose)
+    return build_graph(
+        drives.image, poses, drives.episode, robot, depth=drives.depth, farthest=MAX_DEPTH,
+        goals=args.goals, goal_pictures=drives.goals, **margin,
+        world_version=str(scene_of(args.bag).get('world_version', RECORDED)))
+
+
+def _straightened(bag: Path, drives: DriveSet, robot: RobotSpec, topics: Topics, cache: Path
+                  ) -> np.ndarray:
+    """Where the pictures were taken, [N,3]: odometry, corrected by what is seen again.
+
+    Larger pictures than the network's tell more exactly.
+    """
+    large = drives
+    if drives.image.shape[-1] < LOOKED_AT:
+        large = load_drives(bag, Wanted(robot, LOOKED_AT, topics, every=True), cache)
+    found = straighten(large, robot)
+    facts = found.facts
+    if facts['corrected']:
+        print(f'odometry is straightened: {facts["closures"]:,} times the robot saw a place '
+              f'again; poses moved by up to {facts["moved"]:.2f} m and '
+              f'{math.degrees(facts["turned"]):.0f} deg', flush=True)
+    else:
+        print('odometry stays as it is: too few places are recognised when seen again', flush=True)
+    return found.poses
+
+
+def scene_of(bag: Path) -> dict:
+    """What a simulator said of the scene of a bag; empty: nobody did."""
+    first = next(messages(bag, ('scene',)), None)
+    try:
+        said = json.loads(first.message.data) if first is not None else {}
+    except (AttributeError, TypeError, ValueError):  # another kind of scene
+        return {}
+    return said if isinstance(said, dict) else {}
