@@ -315,17 +315,20 @@ class Training:
         self.clock = end
         episodes = [Episode(*episode) for part in episodes for episode in part]
         self.recent.extend(episodes)
-        tau = self.curriculum.tau
-        if self.curriculum.update(episodes, np.concatenate(numbers), self.progress):
+        tau, present = self.curriculum.tau, np.concatenate(numbers)
+        if self.curriculum.update(episodes, present, self.progress):
             self.env.set_difficulty(self.curriculum.tau)
-        decisions = max(sum(episode.decisions for episode in self.recent), 1)
+        # The first episodes to end are the successful ones: they would flatter until every
+        # environment has ended one.
+        shown = self.recent if present.min() > 1 else ()  # the first is number 1
+        decisions = sum(episode.decisions for episode in shown) or math.nan
         losses = {name: _mean(part[name] for part in losses) for name in losses[0]}
         return dict(zip(COLUMNS, (
             self.frames, self.seconds / 60, speed, tau,
-            _mean(episode.success for episode in self.recent),
-            _mean(episode.reward for episode in self.recent),
-            _mean(episode.decisions for episode in self.recent),
-            sum(episode.collisions for episode in self.recent) / decisions,
+            _mean(episode.success for episode in shown),
+            _mean(episode.reward for episode in shown),
+            _mean(episode.decisions for episode in shown),
+            sum(episode.collisions for episode in shown) / decisions,
             *(losses[name] for name in BASIC_LOSSES), middle - start, end - middle,
             *(losses.get(name, math.nan) for name in TASKS)), strict=True)) | (
                 {} if self.bags is None else self.bags.figures())
