@@ -164,10 +164,11 @@ def bag(driven, tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('driven') / 'bag', *driven)
 
 
+@pytest.mark.slow
 def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, capsys):
     model = write_checkpoint(tmp_path / 'model', size=SIZE, arrival=0.1, stop_threshold=0.5)
     figures, page = tmp_path / 'figures.json', tmp_path / 'page.html'
-    words = ['evaluate', str(model), '--bag', str(bag), '--cache', str(tmp_path / 'decoded'),
+    words = ['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
              '--goals', '24', '--episodes', '8', '--max-decisions', '40', '--json', str(figures)]
     assert main([*words, '--html', str(page)]) == 0
     assert 'all goals of bag' in capsys.readouterr().out
@@ -197,8 +198,9 @@ def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, ba
     model = write_checkpoint(tmp_path / 'model', size=SIZE)
     config = json.loads((model / CONFIG).read_text()) | known
     (model / CONFIG).write_text(json.dumps(config))
-    assert main(['evaluate', str(model), '--bag', str(bag), '--goals', '8', '--episodes', '1',
-                 '--max-decisions', '2', '--no-controls', '--no-straighten']) == code
+    assert main(['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
+                 '--goals', '8', '--episodes', '1', '--max-decisions', '2', '--no-controls',
+                 '--no-straighten']) == code
     assert says in capsys.readouterr().err
 
 
