@@ -171,6 +171,7 @@ def test_it_shows_the_goal_pictures_of_a_folder(listener, tmp_path):
             pytest.approx(goal.pose) for goal in goals]
 
 
+@pytest.mark.slow
 def test_bad_parameters_are_one_line_and_exit_code_2():
     for parameter, word in (('backend:=thor', 'backend'), ('house:=-3', 'seed'),
                             ('odometry_drift:=-1.0', 'odometry_drift'),

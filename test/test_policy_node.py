@@ -203,6 +203,7 @@ def test_the_parameter_is_stronger_than_the_checkpoint(camera, tmp_path):
         assert camera.arrived and not any(camera.arrived)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signals_deliver_zero(camera, checkpoint, tmp_path, number):
     with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=checkpoint) as process:

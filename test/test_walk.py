@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.walk import Walk, as_text
@@ -34,6 +35,7 @@ def test_a_picture_as_text_has_a_half_block_for_two_pixels():
     assert text.count('\u2580') == 16 * 8 and '38;2;255;0;0' in text and '48;2;0;0;0' in text
 
 
+@pytest.mark.slow
 def test_it_runs_in_a_terminal_and_leaves_it_as_it_was():
     master, slave = pty.openpty()
     environment = {key: value for key, value in os.environ.items()
@@ -61,6 +63,7 @@ def test_it_runs_in_a_terminal_and_leaves_it_as_it_was():
     assert output.rstrip().endswith(b'\x1b[?1049l')
 
 
+@pytest.mark.slow
 def test_without_a_terminal_it_says_so():
     environment = {key: value for key, value in os.environ.items()
                    if key not in ('DISPLAY', 'WAYLAND_DISPLAY')}
