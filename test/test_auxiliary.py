@@ -355,7 +355,8 @@ def test_replayed_targets_bear_no_gradient():
     count = int(window.valid.sum())
     for column in range(12):
         end = last_frame(window, column)
-        following = 0.0 if window.terminated[:, column].any() else float(value[end, column].detach())
+        ended = window.terminated[:, column].any()
+        following = 0.0 if ended else float(value[end, column].detach())
         for t in reversed(range(end)):
             following = float(window.reward[t, column]) + 0.9 * following
             error = value[t, column].item() - following
