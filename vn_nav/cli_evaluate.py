@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import datetime
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from vn_nav.cli_world import (
@@ -18,7 +17,12 @@ from vn_nav.cli_world import (
     make_env,
 )
 from vn_nav.errors import UserError
-from vn_nav.evaluation.command import SPLIT_HOUSES, check_evaluate_options, evaluate
+from vn_nav.evaluation.command import (
+    DRIVE_SPLITS,
+    SPLIT_HOUSES,
+    check_evaluate_options,
+    evaluate,
+)
 
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
@@ -87,14 +91,15 @@ def run_evaluate(args: argparse.Namespace) -> int:
     check_backend(args.backend)
     check_evaluate_options(args)
     checkpoint, robot = load_for(args.checkpoint, args.robot)
-    with (_drive(args, checkpoint, robot) if args.bag else _houses(args, checkpoint)) as (
-            splits, measure_split):
+    with tempfile.TemporaryDirectory() as decoded:  # the pictures of a drive are mapped from there
+        splits, measure_split = (
+            _drive(args, checkpoint, robot, args.cache or Path(decoded)) if args.bag else
+            _houses(args, checkpoint))
         evaluate(args, checkpoint.info, splits, measure_split)
     return 0
 
 
-@contextlib.contextmanager
-def _houses(args: argparse.Namespace, checkpoint) -> Iterator[tuple[dict, Callable]]:
+def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
     """The houses of each split, and what measures in them."""
     from vn_sim_bridge.world import WORLD_VERSION
     check_world(checkpoint.info, WORLD_VERSION)
@@ -111,42 +116,39 @@ def _houses(args: argparse.Namespace, checkpoint) -> Iterator[tuple[dict, Callab
             randomisation=args.randomisation,
             goal_seed=UNSEEN_GOALS if name == 'unseen_goals' else 0)
 
-    yield _splits(args, checkpoint.info), measure_split
+    return _splits(args, checkpoint.info), measure_split
 
 
-@contextlib.contextmanager
-def _drive(args: argparse.Namespace, checkpoint, robot) -> Iterator[tuple[dict, Callable]]:
+def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[dict, Callable]:
     """The goals of each split in a recorded drive, and what measures there."""
     from vn_nav.bags.recorded_place import read_place
     from vn_nav.evaluation import evaluator
     from vn_sim_bridge import teach as place
     info = checkpoint.info
-    with tempfile.TemporaryDirectory() as decoded:
-        graph = read_place(args, place.build_graph, robot, checkpoint.config.size,
-                           args.cache or Path(decoded))
-        check_world(info, graph.world_version)
-        graphs = {'all_goals': graph}
-        if args.split:
-            own, others = place.held_out(graph)
-            if others is None:
-                raise UserError('there are enough goals to hold some out',
-                                f'{len(graph.goals)} goals', 'leave out --split')
-            graphs = {'seen_goals': own, 'unseen_goals': others}
-            graphs = {name: graphs[name] for name in args.split}
+    graph = read_place(args, place.build_graph, robot, checkpoint.config.size, cache)
+    check_world(info, graph.world_version)
+    graphs = {'all_goals': graph}
+    if args.split:
+        own, others = place.held_out(graph)
+        if others is None:
+            raise UserError('there are enough goals to hold some out',
+                            f'{len(graph.goals)} goals', 'leave out --split')
+        divided = dict(zip(DRIVE_SPLITS, (own, others), strict=True))
+        graphs = {name: divided[name] for name in args.split}
 
-        def measure_split(name: str, _):
-            def make(_, environments: int, stop: str):
-                return place.make_env(graphs[name], robot, environments, stop=stop, light=True,
-                                      task=info['task'], max_decisions=args.max_decisions)
-            rows = evaluator.measure(
-                make, checkpoint.network, [graph.seed], known=info['houses'],
-                decoding=args.decoding or info['decoding'], episodes=args.episodes,
-                controls=() if args.no_controls else evaluator.CONTROLS, seed=args.seed,
-                threshold=(info.get('stop_threshold') if args.stop_threshold is None
-                           else args.stop_threshold), robot=robot)
-            return rows, {graph.seed: graph.floor_plan()}
+    def measure_split(name: str, _):
+        def make(_, environments: int, stop: str):
+            return place.make_env(graphs[name], robot, environments, stop=stop, light=True,
+                                  task=info['task'], max_decisions=args.max_decisions)
+        rows = evaluator.measure(
+            make, checkpoint.network, [graph.seed], known=info['houses'],
+            decoding=args.decoding or info['decoding'], episodes=args.episodes,
+            controls=() if args.no_controls else evaluator.CONTROLS, seed=args.seed,
+            threshold=(info.get('stop_threshold') if args.stop_threshold is None
+                       else args.stop_threshold), robot=robot)
+        return rows, {graph.seed: graph.floor_plan()}
 
-        yield {name: [graph.seed] for name in graphs}, measure_split
+    return {name: [graph.seed] for name in graphs}, measure_split
 
 
 def run_publish(args) -> int:

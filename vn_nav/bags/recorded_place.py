@@ -31,7 +31,8 @@ def add_place_options(parser: argparse.ArgumentParser) -> None:
                         help='correct odometry by the places that the drive shows twice '
                         '(docs/bags.md)')
     parser.add_argument('--goals', type=int, default=GOALS, help='pictures to drive to, at most')
-    parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags')
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags; '
+                        'default: `decoded` in the folder of a run, or none')
 
 
 def given_place_options(args: argparse.Namespace) -> list[str]:

@@ -16,7 +16,7 @@ from vn_nav.bags.recorded_place import (
 from vn_nav.errors import UserError
 
 OF_HOUSES = ('house', 'houses', 'rooms', 'randomisation')  # options without meaning in a bag
-DRIVE_SPLITS = ('seen_goals', 'unseen_goals')
+DRIVE_SPLITS = ('seen_goals', 'unseen_goals')  # as `vn_nav teach` learns goals, and holds them out
 SPLIT_HOUSES = 20  # of a split that the checkpoint does not know, unless told otherwise
 
 

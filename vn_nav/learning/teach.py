@@ -24,6 +24,7 @@ import torch
 from vn_nav.bags.recorded_place import add_place_options, check_place_options, read_place
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator, tables
+from vn_nav.evaluation.command import DRIVE_SPLITS
 from vn_nav.evaluation.evaluation_page import evaluation_page
 from vn_nav.learning.command import CHANGES, train_config
 from vn_nav.learning.pairs import PairSource
@@ -56,7 +57,6 @@ START = 'start'  # folder of the policy that knows the place, but no way there
 COLLISION_REWARD = -0.05  # of leaving what the pictures cover
 CONTROLS = (evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST)
 BEFORE = 'before teaching'
-SPLITS = ('seen_goals', 'unseen_goals')
 EVALUATION_SEED = 10_000
 
 
@@ -147,7 +147,8 @@ def teach(args: argparse.Namespace, place: Place) -> int:
         folder = train(env, config, args.out, info=_info(args, robot, graph), resume=args.resume,
                        init=init,
                        pairs=lambda: place.make_pairs(own, others, robot, args.seed))
-    _evaluate(args, place, folder, given, robot, dict(zip(SPLITS, (own, others), strict=True)))
+    _evaluate(args, place, folder, given, robot,
+              dict(zip(DRIVE_SPLITS, (own, others), strict=True)))
     print(folder)
     return 0
 
