@@ -29,6 +29,10 @@ PARAMETERS = {
     'max_frame_age': (0.25, 'older frames are dropped [s]', (0.02, 5.0)),
     'max_frame_ahead': (0.05, 'frames stamped later than now are dropped [s]', (0.0, 5.0)),
     'inference_timeout': (0.1, 'later decisions are discarded [s]', (0.005, 2.0)),
+    'odometry_timeout': (0.5, 'odometry silence after which the robot stands still, and in motion '
+                              'stops [s]', (0.05, 5.0)),
+    'require_odometry': (False, 'enable motion only where odometry has come: without it actions '
+                                'run on time alone', None),
     'settle_time': (0.1, "from a motion's last command to a frame at rest [s]", (0.0, 2.0)),
 }
 
