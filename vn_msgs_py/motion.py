@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-
 FARTHEST_M = 1e8  # m: UTM coordinates are within; a pose beyond is a driver's fault
 FASTEST = 1e3  # m/s, rad/s
 
