@@ -92,7 +92,6 @@ def test_ranges_that_are_none_are_refused(text):
         parse_pictures(text)
 
 
-
 def part(*lengths, vouched=False):
     """Stretches of a drive of one picture a second."""
     stretch = np.repeat(np.arange(len(lengths)), lengths)

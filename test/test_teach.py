@@ -253,8 +253,9 @@ def test_two_houses_are_no_one_place(joint, houses, tmp_path, capsys):
     assert own[1] == '1' and abs(int(own[2]) - len(one)) <= 20
     assert main([*words, '--pictures', f'{own[1]}-{len(one)}']) == 0
     assert 'moved by up to' in capsys.readouterr().out
-    notes = load_checkpoint(tmp_path / 'out' / 'checkpoint').info['notes']
-    assert f'pictures 1-{len(one)}' in notes
+    info = load_checkpoint(tmp_path / 'out' / 'checkpoint').info
+    assert f'pictures 1-{len(one)}' in info['notes'] and 'recorded pictures' in info['data']
+    assert 'no episode was driven' in (tmp_path / 'out' / 'checkpoint' / 'README.md').read_text()
     # Odometry alone shows a jump, and what goes on it cannot tell apart.
     assert main(['evaluate', 'models/anywhere', '--bag', str(bag), '--no-straighten', '--episodes',
                  '1', '--max-decisions', '2', '--no-controls']) == (

@@ -300,6 +300,7 @@ class Teaching:
             'world_version': self.graph.world_version, 'preset': PRESET, 'stop_threshold': None,
             'command': 'vn_nav ' + shlex.join(word for word in sys.argv[1:]
                                               if word != '--resume'),
+            'data': f'{len(self.graph.poses):,} recorded pictures of {self.args.bag.name}{part}',
             'notes': f'Taught in the pictures of {self.args.bag.name}{part}: '
                      f'{"; ".join(self.graph.words)}.'}
 
