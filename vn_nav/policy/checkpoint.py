@@ -44,6 +44,8 @@ INFO = {
     'frames': 0,  # agent decisions
     'minutes': 0.0,  # wall-clock of training
     'command': '',  # that trained it
+    'data': '',  # recorded pictures that it learned from, in words; empty: it learned by driving
+    'losses': [],  # what `vn_nav pretrain` learned; no episode was driven
     'results': {},  # measured figures and controls, by name
     'notes': '',
 }
@@ -215,15 +217,20 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
             config['decoding']],
         'Network': f'{_describe(network)}; {parameters:,} parameters, {size / 1e6:.1f} MB',
-        'Trained in': home,
-        'Training': f'{config["frames"]:,} frames (agent decisions) in {config["minutes"]:.1f} '
-                    f'minutes, seed {config["seed"]}',
+        'Trained in': config['data'] or home,
+        **({'Losses': ', '.join(config['losses']).replace('_', ' ')} if config['losses'] else {}),
+        'Training': ('no episode was driven; ' if config['data'] and not config['frames'] else
+                     f'{config["frames"]:,} frames (agent decisions) in ')
+        + f'{config["minutes"]:.1f} minutes, seed {config["seed"]}',
         'World version': config['world_version'],
         'Weights': f'SHA-256 `{config["sha256"]}`',
     }
+    purpose = ('Drives a robot to the place where a picture was taken.' if not config['losses']
+               else 'Weights to begin a training with (`vn_nav train --init`), pre-trained on '
+               'recorded pictures. No episode was driven: whether it arrives is not known.')
     lines = ['# Visual navigation policy', '',
-             'Drives a robot to the place where a picture was taken. It sees its camera, the goal '
-             'picture and its own last action; no map, no depth, no pose.', '',
+             f'{purpose} It sees its camera, the goal picture and its own last action; no map, no '
+             'depth, no pose.', '',
              '| | |', '|---|---|', *(f'| {key} | {value} |' for key, value in facts.items())]
     if config['command']:
         lines += ['', 'Trained with', '', '```', str(config['command']), '```']
