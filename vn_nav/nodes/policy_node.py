@@ -63,9 +63,11 @@ class PolicyNode(LifecycleNode):
                 return SetParametersResult(successful=False, reason=(
                     f'{parameter.name} is fixed while the node is active; received '
                     f'{parameter.value!r}; deactivate first'))
-            if isinstance(parameter.value, float) and not math.isfinite(parameter.value):
-                return SetParametersResult(successful=False, reason=(
-                    f'{parameter.name} is finite; received {parameter.value}'))
+            try:
+                if parameter.name in policy_parameters.PARAMETERS:
+                    policy_parameters.check(parameter.name, parameter.value)
+            except UserError as error:
+                return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     # Lifecycle.
@@ -117,7 +119,7 @@ class PolicyNode(LifecycleNode):
 
     def _make_interfaces(self, compressed: bool, shadow: bool) -> None:
         self._diagnosis = Diagnosis(self, self._output.publisher, self.navigator.robot.name)
-        image = 'image_raw/compressed' if compressed else 'image_raw'
+        self._image_topic = image = 'image_raw/compressed' if compressed else 'image_raw'
         told = [(self.destroy_subscription, self.create_subscription(
             String, 'executed_action', self._on_executed_action, qos('executed_action')))
         ] if shadow else []
@@ -153,7 +155,18 @@ class PolicyNode(LifecycleNode):
             for name, loop in (('inference', self._worker.run), ('output', self._output.run))]
         for thread in self._threads:
             thread.start()
+        self._say_what_it_waits_for()
         return super().on_activate(state)
+
+    def _say_what_it_waits_for(self) -> None:
+        """What somebody at a silent robot wants to know."""
+        pictures, goal, odometry = map(self.resolve_topic_name, (
+            self._image_topic, 'goal_image', 'odom'))
+        enable = '' if self.auto_enable else (
+            f', then for `ros2 service call {self.get_fully_qualified_name()}/enable '
+            'std_srvs/srv/SetBool "{data: true}"`')
+        self.get_logger().info(f'active: waits for pictures on {pictures}, a goal picture on '
+                               f'{goal}, odometry on {odometry}{enable}')
 
     def on_deactivate(self, state) -> TransitionCallbackReturn:
         """Zero first, then silence."""
@@ -315,13 +328,20 @@ def drive(node: PolicyNode, ended: Ended) -> None:
     """Bring the node up and serve it; a callback that fails takes it out of action."""
     if node.get_parameter('autostart').value:
         for transition in (node.trigger_configure, node.trigger_activate):
+            if ended.is_set():
+                return
             if transition() != TransitionCallbackReturn.SUCCESS:
-                raise node.failure
+                raise node.failure or UserError(
+                    f'{transition.__name__} succeeds', 'an error, see above', 'report it')
+    else:
+        name = node.get_fully_qualified_name()
+        node.get_logger().info(f'not configured: waits for `ros2 lifecycle set {name} configure`, '
+                               'then activate')
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not ended.is_set():
         try:
-            executor.spin_once(timeout_sec=0.1)
+            executor.spin_once(timeout_sec=0.05)
         except ExternalShutdownException:
             raise
         except Exception as error:  # stand still, go inactive, say so
@@ -332,7 +352,8 @@ def drive(node: PolicyNode, ended: Ended) -> None:
 
 def main(args=None) -> int:
     """Entry point: 0 after a signal, 2 and one line on standard error for bad input."""
-    return run_node('policy_node', PolicyNode, drive, args)
+    return run_node('policy_node', lambda _: PolicyNode(), drive, args, about=__doc__,
+                    parameters=policy_parameters.PARAMETERS)
 
 
 if __name__ == '__main__':
