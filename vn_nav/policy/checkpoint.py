@@ -187,8 +187,8 @@ def _read_network(config: dict, where: str) -> tuple[NetworkConfig, dict[str, tu
     names, given = config['action_names'], config['network']
     if not (isinstance(names, list) and len(names) <= 256
             and all(isinstance(name, str) for name in names)):
-        raise UserError('action_names is a list of at most 256 names', f'{where}: {reprlib.repr(names)}',
-                        'get the checkpoint again')
+        raise UserError('action_names is a list of at most 256 names',
+                        f'{where}: {reprlib.repr(names)}', 'get the checkpoint again')
     if not isinstance(given, dict):
         raise UserError(f'the network in {CONFIG} is a mapping', f'{where}: {reprlib.repr(given)}',
                         'get the checkpoint again')
@@ -285,11 +285,12 @@ def _check_entry(key: str, value: object, where: str) -> None:
     """Raise a `UserError` for a value of another type than its key's, or out of its range."""
     rule = INFO_TYPES[key]
     kinds, span = (rule[0], rule[1:]) if len(rule) == 3 else (rule, ())
-    names = ' or '.join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
+    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
     kept = isinstance(value, kinds) and not isinstance(value, bool)
     if kept and key == 'houses':
         kept = all(isinstance(house, int) and not isinstance(house, bool) for house in value)
     if not kept:
+        names = ' or '.join(kind.__name__ for kind in kinds)
         raise UserError(f'{key} is {names}', reprlib.repr(value), f'correct {where}')
     if span and not span[0] <= value <= span[1]:
         raise UserError(f'{key} lies between {span[0]:g} and {span[1]:g}', value,
