@@ -80,10 +80,12 @@ def test_plug_ins_of_an_installed_ros_stay_outside(tmp_path):
     names = {'launch_ros': 'launch_testing_ros_pytest_entrypoint',
              'launch_testing': 'launch_testing_hooks', 'launch_pytest': 'launch_pytest_plugin'}
     for name, module in names.items():
-        (tmp_path / f'{module}.py').write_text('def pytest_launch_of_another_pytest():\n    pass\n')
+        (tmp_path / f'{module}.py').write_text(
+            'def pytest_launch_of_another_pytest():\n    pass\n')
         folder = tmp_path / f'{module}-1.0.dist-info'
         folder.mkdir()
-        (folder / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n')
+        (folder / 'METADATA').write_text(
+            f'Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n')
         (folder / 'entry_points.txt').write_text(f'[pytest11]\n{name} = {module}\n')
     words = [sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', '--collect-only', '-q']
     environment = {name: value for name, value in os.environ.items()
