@@ -205,7 +205,8 @@ def test_the_parameter_is_stronger_than_the_checkpoint(camera, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP,
+                                    signal.SIGQUIT])
 def test_signals_deliver_zero(camera, checkpoint, tmp_path, number):
     with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=checkpoint) as process:
         camera.enable()

@@ -207,6 +207,7 @@ def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, ba
                                                            capsys):
     model = write_checkpoint(tmp_path / 'model', size=SIZE)
     config = json.loads((model / CONFIG).read_text()) | known
+    del config['config_sha256']  # changed on purpose
     (model / CONFIG).write_text(json.dumps(config))
     assert main(['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
                  '--goals', '8', '--episodes', '1', '--max-decisions', '2', '--no-controls',

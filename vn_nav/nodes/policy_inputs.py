@@ -68,6 +68,12 @@ class PolicyInputs:
         self._types[resolved] = kind
         return resolved
 
+    @property
+    def awaited(self) -> tuple[str, str, str]:
+        """Resolved names of the topics without which nothing moves: pictures, goal, odometry."""
+        image, _, goal, odometry = list(self._types)[:4]
+        return image, goal, odometry
+
     # Callbacks, on the executor's thread.
 
     def _on_image(self, message) -> None:

@@ -63,9 +63,11 @@ class PolicyNode(LifecycleNode):
                 return SetParametersResult(successful=False, reason=(
                     f'{parameter.name} is fixed while the node is active; received '
                     f'{parameter.value!r}; deactivate first'))
-            if isinstance(parameter.value, float) and not math.isfinite(parameter.value):
-                return SetParametersResult(successful=False, reason=(
-                    f'{parameter.name} is finite; received {parameter.value}'))
+            try:
+                if parameter.name in policy_parameters.PARAMETERS:
+                    policy_parameters.check(parameter.name, parameter.value)
+            except UserError as error:
+                return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     # Lifecycle.
@@ -147,7 +149,17 @@ class PolicyNode(LifecycleNode):
         self.broken = ''
         self._threads = WorkThreads({'inference': self._worker.run, 'output': self._output.run},
                                     self._on_failed_thread)
+        self._say_what_it_waits_for()
         return super().on_activate(state)
+
+    def _say_what_it_waits_for(self) -> None:
+        """What somebody at a silent robot wants to know."""
+        pictures, goal, odometry = self._inputs.awaited
+        enable = '' if self.auto_enable else (
+            f', then for `ros2 service call {self.get_fully_qualified_name()}/enable '
+            'std_srvs/srv/SetBool "{data: true}"`')
+        self.get_logger().info(f'active: waits for pictures on {pictures}, a goal picture on '
+                               f'{goal}, odometry on {odometry}{enable}')
 
     def on_deactivate(self, state) -> TransitionCallbackReturn:
         """Zero first, then silence."""
@@ -326,17 +338,20 @@ def drive(node: PolicyNode, ended: Ended) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     if node.get_parameter('autostart').value:
-        if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
-            raise node.failure
+        _transit(node, node.trigger_configure)
         if not node.has_clock():
-            node.get_logger().info('waiting for /clock (use_sim_time is set)')
+            node.get_logger().info('waits for /clock (use_sim_time is set)')
         while not node.has_clock() and not ended.is_set():
-            executor.spin_once(timeout_sec=0.1)
-        if not ended.is_set() and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
-            raise node.failure
+            executor.spin_once(timeout_sec=0.05)
+        if not ended.is_set():
+            _transit(node, node.trigger_activate)
+    else:
+        name = node.get_fully_qualified_name()
+        node.get_logger().info(f'not configured: waits for `ros2 lifecycle set {name} configure`, '
+                               'then activate')
     while not ended.is_set():
         try:
-            executor.spin_once(timeout_sec=0.1)
+            executor.spin_once(timeout_sec=0.05)
             node.tend()
         except ExternalShutdownException:
             raise
@@ -347,9 +362,16 @@ def drive(node: PolicyNode, ended: Ended) -> None:
                 node.trigger_deactivate()
 
 
+def _transit(node: PolicyNode, transition) -> None:
+    if transition() != TransitionCallbackReturn.SUCCESS:
+        raise node.failure or UserError(f'{transition.__name__} succeeds', 'an error, see above',
+                                        'report it')
+
+
 def main(args=None) -> int:
     """Entry point: 0 after a signal, 2 and one line on standard error for bad input."""
-    status = run_node('policy_node', PolicyNode, drive, args)
+    status = run_node('policy_node', lambda _: PolicyNode(), drive, args, about=__doc__,
+                      parameters=policy_parameters.PARAMETERS)
     if any(thread.name == 'inference' for thread in threading.enumerate()):
         # It sits in a decision that does not end. The zero is delivered, everything is closed;
         # to leave in the ordinary way would abort the process.

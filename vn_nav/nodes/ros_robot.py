@@ -115,7 +115,7 @@ class RosRobot(Node):
     def __init__(self, context: Context, namespace: str, robot: RobotSpec, size: int, *,
                  lock_step: bool, max_decisions: int, ended: Ended, bag: Path | None):
         super().__init__(NAME, namespace=namespace or None, context=context)
-        policy_parameters.declare(self, PARAMETERS)
+        policy_parameters.declare(self, PARAMETERS, others=None)
         self.patience = self.declare_parameter('patience', PATIENCE, ParameterDescriptor(
             description='without a picture, a goal or leave to move a training ends after [s]',
             floating_point_range=[FloatingPointRange(from_value=1.0, to_value=1e6)])).value

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import reprlib
 import shutil
 from pathlib import Path
 
@@ -20,9 +21,15 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.structured_file import read_json
 
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
 FORMAT = 2
+OWN = {'format', 'network', 'action_names', 'sha256'}  # keys beside those of INFO
+CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
+HEADER_BYTES = 1_000_000  # of a safetensors file, beside its weights
+MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
+NUMBER = (int, float)
 DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
 # What a checkpoint says beside its weights, and what it says when nobody told it.
@@ -48,6 +55,17 @@ INFO = {
     'losses': [],  # what `vn_nav pretrain` learned; no episode was driven
     'results': {},  # measured figures and controls, by name
     'notes': '',
+}
+# Their types, and the least and the greatest value of numbers. None is allowed where it is the
+# value when nobody told.
+INFO_TYPES = {
+    'world_version': (str,), 'decoding': (str,), 'task': (str,), 'randomisation': (str,),
+    'preset': (str,), 'command': (str,), 'notes': (str,), 'results': (dict,),
+    'houses': (list, tuple), 'rooms': (int, 1, 1000), 'objects': (int, 0, 1000),
+    'goals_per_room': (int, 1, 1000), 'goal_variants': (int, 1, 1000),
+    'stop_threshold': (NUMBER, 0, 1), 'seed': (int, -2**63, 2**64), 'frames': (int, 0, 2**63),
+    'minutes': (NUMBER, 0, 1e9), 'camera_fov_deg': (NUMBER, 1e-3, 179),
+    'camera_height': (NUMBER, 1e-3, 100),
 }
 
 
@@ -93,6 +111,9 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
     }
     del config['network']['actions']  # said once, under action_names
     try:
+        # As it will be read: JSON has no tuples, and only text as keys.
+        config = json.loads(json.dumps(config, allow_nan=False))
+        config[CHECKSUM] = _config_checksum(config)
         text = json.dumps(config, indent=2, allow_nan=False) + '\n'
     except (TypeError, ValueError) as error:
         raise UserError('info holds only JSON values', str(error), 'convert them first') from error
@@ -117,58 +138,120 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
         expect_actions: refuse any other action names or order.
 
     Raises:
-        UserError: a missing file, corrupt weights, another architecture, unknown keys, or other
-            actions.
+        UserError: a missing or corrupt file, another architecture, unknown keys, values of a
+            wrong type or size, or other actions.
     """
     folder = Path(folder)
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
             raise UserError(f'a checkpoint is a folder with {CONFIG} and {WEIGHTS}',
                             str(folder / name), 'pass such a folder; shipped ones are in models/')
-    try:
-        config = json.loads((folder / CONFIG).read_text())
-    except ValueError as error:
-        raise UserError(f'{CONFIG} is JSON', f'{folder / CONFIG}: {error}',
-                        'get the checkpoint again') from error
-    if not isinstance(config, dict) or config.get('format') != FORMAT:
-        received = config.get('format') if isinstance(config, dict) else type(config).__name__
-        raise UserError(f'{CONFIG} has format {FORMAT}', received,
-                        'use the version of vn_nav that wrote it, or train again')
     where = str(folder / CONFIG)
-    own = {'format', 'network', 'action_names', 'sha256'}
-    missing = own - config.keys()
-    if missing:
-        raise UserError(f'{CONFIG} has the keys {", ".join(sorted(own))}',
+    config = read_json(where, CONFIG, 'get the checkpoint again')
+    if config.get('format') != FORMAT:
+        raise UserError(f'{CONFIG} has format {FORMAT}', reprlib.repr(config.get('format')),
+                        'use the version of vn_nav that wrote it, or train again')
+    if missing := OWN - config.keys():
+        raise UserError(f'{CONFIG} has the keys {", ".join(sorted(OWN))}',
                         f'{where} without {", ".join(sorted(missing))}',
                         'get the checkpoint again')
-    info = _check_info({key: value for key, value in config.items() if key not in own}, where)
-    weights = (folder / WEIGHTS).read_bytes()
+    if CHECKSUM in config and config.pop(CHECKSUM) != _config_checksum(config):
+        raise UserError(f'{CONFIG} is as it was written ({CHECKSUM} is the SHA-256 of the rest)',
+                        where, 'the file is corrupt: get the checkpoint again; after a change of '
+                        f'your own remove {CHECKSUM}')
+    info = _check_info({key: value for key, value in config.items() if key not in OWN}, where)
+    network_config, shapes = _read_network(config, where)
+    if expect_actions is not None and tuple(expect_actions) != network_config.actions:
+        raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
+                        ', '.join(network_config.actions), 'use a checkpoint trained for them')
+    weights = _read_weights(folder / WEIGHTS, shapes)
     digest = hashlib.sha256(weights).hexdigest()
     if digest != config['sha256']:
         raise UserError(f'the SHA-256 of {WEIGHTS} is the one in {CONFIG}', digest,
                         f'the file is corrupt or not the one of {where}: get it again')
-    try:
-        network_config = NetworkConfig(actions=tuple(config['action_names']), **config['network'])
-    except TypeError as error:
-        known = ', '.join(field.name for field in dataclasses.fields(NetworkConfig))
-        raise UserError(f'the network in {CONFIG} has only the fields {known}',
-                        f'{where}: {error}', 'use the version of vn_nav that wrote it, or '
-                        'train again') from error
-    if expect_actions is not None and tuple(expect_actions) != network_config.actions:
-        raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
-                        ', '.join(network_config.actions), 'use a checkpoint trained for them')
+    tensors = _check_weights(weights, shapes, str(folder / WEIGHTS))
     network = Policy(network_config)
-    _load_weights(network, weights, str(folder / WEIGHTS))
+    network.load_state_dict(tensors)
     return LoadedCheckpoint(network.eval(), network_config, {**info, 'sha256': digest})
 
 
-def _load_weights(network: Policy, weights: bytes, where: str) -> None:
+def _config_checksum(config: dict) -> str:
+    """SHA-256 of what a configuration says, however its file is laid out."""
+    text = json.dumps(config, sort_keys=True, separators=(',', ':'), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _read_network(config: dict, where: str) -> tuple[NetworkConfig, dict[str, tuple]]:
+    """The network of a `config.json`, and the shapes of its weights by name.
+
+    The shapes come from a network without memory: an absurd size must not be allocated.
+    """
+    names, given = config['action_names'], config['network']
+    if not (isinstance(names, list) and len(names) <= 256
+            and all(isinstance(name, str) for name in names)):
+        raise UserError('action_names is a list of at most 256 names',
+                        f'{where}: {reprlib.repr(names)}', 'get the checkpoint again')
+    if not isinstance(given, dict):
+        raise UserError(f'the network in {CONFIG} is a mapping', f'{where}: {reprlib.repr(given)}',
+                        'get the checkpoint again')
+    fields = {field.name: field.default for field in dataclasses.fields(NetworkConfig)
+              if field.name != 'actions'}
+    for name, value in given.items():
+        if name not in fields:
+            raise UserError(f'the network in {CONFIG} has only the fields {", ".join(fields)}',
+                            f'{where}: {name}', 'use the version of vn_nav that wrote it, or '
+                            'train again')
+        if not _fits(value, fields[name]):
+            raise UserError(f'{name} of the network in {CONFIG} is of the type and '
+                            f'size of {fields[name]!r}', f'{where}: {reprlib.repr(value)}',
+                            'get the checkpoint again')
+    try:
+        network = NetworkConfig(actions=tuple(names), **given)
+        with torch.device('meta'):
+            shapes = {name: tuple(tensor.shape)
+                      for name, tensor in Policy(network).state_dict().items()}
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise UserError(f'the network in {CONFIG} can be built',
+                        f'{where}: {" ".join(str(error).split())[:200]}',
+                        'get the checkpoint again') from error
+    return network, shapes
+
+
+def _fits(value: object, default: object) -> bool:
+    """Whether a value out of JSON has the type of a field of `NetworkConfig`."""
+    if isinstance(default, tuple):
+        return isinstance(value, list) and all(
+            isinstance(part, (str, int)) or (isinstance(part, list) and all(
+                _fits(number, 0.0) for number in part)) for part in value)
+    if isinstance(default, float):
+        return (isinstance(value, NUMBER) and not isinstance(value, bool)
+                and math.isfinite(value))
+    return type(value) is type(default) and not (type(value) is int and abs(value) > MAX_SIZE)
+
+
+def _read_weights(path: Path, shapes: dict[str, tuple]) -> bytes:
+    """The file's bytes, no more than these weights can have."""
+    most = 4 * sum(map(math.prod, shapes.values())) + HEADER_BYTES
+    try:
+        with path.open('rb') as file:
+            weights = file.read(min(most, path.stat().st_size) + 1)
+    except OSError as error:
+        raise UserError(f'{WEIGHTS} can be read', f'{path}: {error.strerror}',
+                        'correct its permissions, or get the checkpoint again') from error
+    if len(weights) > most:
+        raise UserError(f'{WEIGHTS} fits the network of {CONFIG}: at most {most} bytes',
+                        f'{path.stat().st_size} in {path}', 'get the checkpoint again')
+    return weights
+
+
+def _check_weights(weights: bytes, wanted: dict[str, tuple], where: str
+                   ) -> dict[str, torch.Tensor]:
+    """The weights by name, float32."""
     try:
         tensors = safetensors.torch.load(weights)
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, KeyError, ValueError) as error:
         raise UserError(f'{WEIGHTS} is a safetensors file', f'{where}: {error}',
                         'get the checkpoint again') from error
-    wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     if wanted != found:
         name = sorted(name for name in wanted.keys() | found.keys()
@@ -179,7 +262,7 @@ def _load_weights(network: Policy, weights: bytes, where: str) -> None:
         if tensor.dtype not in (torch.float16, torch.float32) or not torch.isfinite(tensor).all():
             raise UserError('weights are finite numbers of 16 or 32 bits', f'{name} in {where}',
                             'get the checkpoint again')
-    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    return {name: tensor.float() for name, tensor in tensors.items()}
 
 
 def _check_info(info: dict, where: str) -> dict:
@@ -192,13 +275,28 @@ def _check_info(info: dict, where: str) -> dict:
     missing = [key for key, value in full.items() if value is REQUIRED]
     if missing:
         raise UserError(f'{CONFIG} has the key {missing[0]}', f'{where} without it', 'add it')
+    for key, value in full.items():
+        if value is not None or INFO[key] is not None:
+            _check_entry(key, value, where)
     if full['decoding'] not in DECODINGS:
         raise UserError('decoding is sample or greedy', full['decoding'], f'correct {where}')
-    for key, limit in (('camera_fov_deg', 179.0), ('camera_height', 100.0)):
-        value = full[key]
-        if not (isinstance(value, (int, float)) and math.isfinite(value) and 0 < value <= limit):
-            raise UserError(f'{key} lies in (0, {limit:g}]', value, f'correct {where}')
     return full
+
+
+def _check_entry(key: str, value: object, where: str) -> None:
+    """Raise a `UserError` for a value of another type than its key's, or out of its range."""
+    rule = INFO_TYPES[key]
+    kinds, span = (rule[0], rule[1:]) if len(rule) == 3 else (rule, ())
+    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+    kept = isinstance(value, kinds) and not isinstance(value, bool)
+    if kept and key == 'houses':
+        kept = all(isinstance(house, int) and not isinstance(house, bool) for house in value)
+    if not kept:
+        names = ' or '.join(kind.__name__ for kind in kinds)
+        raise UserError(f'{key} is {names}', reprlib.repr(value), f'correct {where}')
+    if span and not span[0] <= value <= span[1]:
+        raise UserError(f'{key} lies between {span[0]:g} and {span[1]:g}', value,
+                        f'correct {where}')
 
 
 def model_card(config: dict, parameters: int, size: int) -> str:
