@@ -224,3 +224,8 @@ def test_not_finite_output_is_an_error():
     policy = BatchedPolicy(network, 1)
     with pytest.raises(FloatingPointError, match='finite'):
         policy.act(observed(pictures(1), -1), pictures(2), np.array([True]))
+
+
+def test_every_key_has_a_type():
+    from vn_nav.policy import checkpoint
+    assert checkpoint.INFO.keys() == checkpoint.INFO_TYPES.keys()

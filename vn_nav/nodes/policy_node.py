@@ -79,6 +79,11 @@ class PolicyNode(LifecycleNode):
         except UserError as error:
             self._fail(error)
             return TransitionCallbackReturn.FAILURE
+        except Exception as error:  # rclpy would turn it into an ERROR without a word
+            self._let_go()
+            self._fail(UserError('policy_node can be configured', shorten(repr(error)),
+                                 'report it, with checkpoint and robot file'))
+            return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
     def _fail(self, error: UserError) -> None:

@@ -61,6 +61,7 @@ INFO = {
 INFO_TYPES = {
     'world_version': (str,), 'decoding': (str,), 'task': (str,), 'randomisation': (str,),
     'preset': (str,), 'command': (str,), 'notes': (str,), 'results': (dict,),
+    'data': (str,), 'losses': (list, tuple),
     'houses': (list, tuple), 'rooms': (int, 1, 1000), 'objects': (int, 0, 1000),
     'goals_per_room': (int, 1, 1000), 'goal_variants': (int, 1, 1000),
     'stop_threshold': (NUMBER, 0, 1), 'seed': (int, -2**63, 2**64), 'frames': (int, 0, 2**63),
