@@ -1,5 +1,6 @@
 """sim_bridge_node as a robot: Twist alone, time-outs, episodes, and parity with NavigationEnv."""
 
+import dataclasses
 import json
 import signal
 import subprocess
@@ -22,8 +23,9 @@ from vn_msgs_py.motion import fill_twist, odometry_to_array
 from vn_nav.bags.reader import read_bag
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.nodes.qos import qos
+from vn_nav.policy.motion import ActionExecutor
 from vn_nav.resources import share_file
-from vn_nav.robot import RobotSpec
+from vn_nav.robot import AXES, Action, RobotSpec, load_robot
 from vn_sim_bridge.env import EnvConfig, NavigationEnv
 from vn_sim_bridge.goal_pictures import GoalPicture, save_goal_pictures
 from vn_sim_bridge.houses.procedural import generate_house
@@ -31,6 +33,8 @@ from vn_sim_bridge.simulated_robot import TERMINATED, TICK, SimulatedRobot
 from vn_sim_bridge.tasks import wrap_angle
 
 pytestmark = pytest.mark.ros
+DEMO_BASE = str(share_file('config/robots/demo_base.yaml'))
+BRIDGE = 'vn_sim_bridge.bridge_node'
 OUTCOMES = {'reward': Float32, 'episode_end': UInt8, 'episode_result': String}
 
 
@@ -64,13 +68,21 @@ class Listener:
         assert len(self.heard[name]) == count
         return self.heard[name][-1]
 
-    def drive(self, delta):
-        """One decision in lock-step: a displacement in a single tick, then rest."""
-        velocity, rewards = np.asarray(delta) / TICK, len(self.heard['reward'])
-        self.command.publish(fill_twist(Twist(), velocity))
-        wait_until(lambda: self.pose('odom')[3:6].any(), self.spin, 20)
-        self.command.publish(Twist())
-        wait_until(lambda: not self.pose('odom')[3:6].any(), self.spin, 20)
+    def drive(self, delta, robot):
+        """One decision in lock-step: a displacement along one axis, under the robot's limits."""
+        rewards = len(self.heard['reward'])
+        axis = AXES[int(np.flatnonzero(delta)[0])]
+        executor = ActionExecutor(dataclasses.replace(robot, actions=(
+            Action('it', **{axis: float(delta[AXES.index(axis)])}),)), tolerance=1e-9, creep=0.0)
+        executor.begin(0, None)
+        over = False
+        while not over:
+            velocity, over = executor.velocity(TICK, None)
+            before, moving = self.pose('odom')[6], self.pose('odom')[3:6].any()
+            self.command.publish(fill_twist(Twist(), velocity))
+            # One tick for one command; what still comes of the rest before is not its answer.
+            wait_until(lambda: self.pose('odom')[6] > before and (  # noqa: B023
+                moving or self.pose('odom')[3:6].any()), self.spin, 20)  # noqa: B023
         # Each topic has its own way here: what stands on one may still be under way on another.
         wait_until(lambda: self.pose()[6] >= self.pose('odom')[6], self.spin, 20)
         return self.hears('reward', rewards + 1).data
@@ -96,6 +108,9 @@ def test_any_twist_drives_it_and_silence_stops_it(listener, tmp_path):
         assert scene['house'] == 7 and len(scene['goals']) == 5
         assert decode_rgb(listener.heard['image_raw'][-1]).shape == (84, 84, 3)
         assert listener.heard['camera_info'][-1].k[0] == pytest.approx(42.0)  # 90 degrees
+        assert listener.heard['camera_info'][-1].k[2] == 41.5
+        covariance = np.array(listener.heard['odom'][-1].pose.covariance).reshape(6, 6)
+        assert (np.linalg.eigvalsh(covariance) > 0).all()
         before = listener.pose()
         message = Twist()
         message.angular.z = 0.5
@@ -104,7 +119,7 @@ def test_any_twist_drives_it_and_silence_stops_it(listener, tmp_path):
             listener.pause(0.05)
         turned = wrap_angle(listener.pose()[2] - before[2])
         assert 0.25 < turned < 0.7  # a second at 0.5 rad/s, on a machine that may be busy
-        listener.pause(0.8)  # half a second without a command is enough
+        listener.pause(1.2)  # half a second without a command, and 0.3 s to brake
         assert listener.pose()[5] == 0.0
         stands = listener.pose()
         listener.pause(0.5)
@@ -142,12 +157,12 @@ def test_reset_takes_the_goal_pose_and_refuses_a_wall(listener, tmp_path):
 
 def test_odom_drifts_and_the_truth_does_not(listener, tmp_path):
     with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7, noise=False,
-               time='lock_step', odometry_drift=30.0):
+               time='lock_step', robot=DEMO_BASE, odometry_drift=30.0):
         wait_until(lambda: listener.heard['odom'] and listener.heard['ground_truth/odom']
                    and listener.command.get_subscription_count(), listener.spin)
         said, true = listener.pose('odom')[:3], listener.pose()[:3]
         for _ in range(3):
-            listener.drive((0.0, 0.0, 0.4, 0.0))
+            listener.drive((0.0, 0.0, 0.4, 0.0), load_robot(DEMO_BASE))
         assert wrap_angle(listener.pose()[2] - true[2]) == pytest.approx(1.2, abs=1e-9)
         off = wrap_angle(listener.pose('odom')[2] - said[2]) - 1.2
         assert 0.001 < abs(off) < 0.6  # 6 deg are one standard deviation
@@ -175,6 +190,7 @@ def test_it_shows_the_goal_pictures_of_a_folder(listener, tmp_path):
 def test_bad_parameters_are_one_line_and_exit_code_2():
     for parameter, word in (('backend:=thor', 'backend'), ('house:=-3', 'seed'),
                             ('odometry_drift:=-1.0', 'odometry_drift'),
+                            ('start_time:=-1.0', 'start_time'),
                             ('goals:=/nowhere', 'goals.json'),
                             ('stop:=never', 'stop'), ('time:=yesterday', 'time'),
                             ('rooms:=40', 'rooms')):
@@ -236,13 +252,14 @@ def test_the_robot_ends_the_episode_when_stops_are_declared(listener, journey, t
     def result():
         return json.loads(listener.heard['episode_result'][-1].data)
     with child('vn_sim_bridge.bridge_node', tmp_path / 'log', house=7, noise=False, seed=5,
-               time='lock_step', stop='declared', episodes=3, exit_when_done=True) as bridge:
+               time='lock_step', robot=DEMO_BASE, stop='declared', episodes=3,
+               exit_when_done=True) as bridge:
         wait_until(lambda: listener.heard['odom'] and listener.heard['episode']
                    and listener.arrived.get_subscription_count()
                    and listener.command.get_subscription_count(), listener.spin)
         say(False)  # the goal is taken
         for delta in deltas:
-            assert listener.drive(delta) == 0.0
+            assert listener.drive(delta, load_robot(DEMO_BASE)) == 0.0
         listener.pause(0.3)
         assert not listener.heard['episode_end'], 'it stands at the goal and has not said so'
         say(True)
@@ -272,14 +289,13 @@ def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
     """The parity test: policy_node and bridge over ROS against NavigationEnv, noise off."""
     sequences, length = 50, 8
     checkpoint = write_checkpoint(tmp_path / 'checkpoint')
-    base = str(share_file('config/robots/demo_base.yaml'))
     with child('vn_nav.nodes.recorder_node', tmp_path / 'recorder.log',
                output=tmp_path / 'bag') as recorder, \
          child('vn_sim_bridge.bridge_node', tmp_path / 'bridge.log', house=7, time='lock_step',
-               robot=base, noise=False, seed=5, episodes=sequences, max_decisions=length,
+               robot=DEMO_BASE, noise=False, seed=5, episodes=sequences, max_decisions=length,
                exit_when_done=True) as bridge, \
          child('vn_nav.nodes.policy_node', tmp_path / 'policy.log', checkpoint=checkpoint,
-               time='lock_step', robot=base, auto_enable=True, seed=5) as policy:
+               time='lock_step', robot=DEMO_BASE, auto_enable=True, seed=5) as policy:
         bridge.wait(100)
         for process in (policy, recorder):
             process.send_signal(signal.SIGINT)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from vn_msgs_py.topics import BEST_EFFORT, LATCHED, Topic, topic
+from vn_msgs_py.topics import BEST_EFFORT, LATCHED, RELIABLE, Topic, topic
 
 
 def qos(name: str, *, depth: int | None = None) -> QoSProfile:
@@ -25,3 +27,12 @@ def profile(entry: Topic, *, depth: int | None = None) -> QoSProfile:
                      else ReliabilityPolicy.RELIABLE),
         durability=(DurabilityPolicy.TRANSIENT_LOCAL if entry.durability == LATCHED
                     else DurabilityPolicy.VOLATILE))
+
+
+def offered(name: str) -> QoSProfile:
+    """What a publisher of this package offers: reliable, also where a listener asks for less.
+
+    Best effort is served by a reliable publisher as well; a listener that insists on reliable (an
+    RViz display) would get nothing from a best-effort one.
+    """
+    return profile(dataclasses.replace(topic(name), reliability=RELIABLE))

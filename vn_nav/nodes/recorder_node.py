@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import importlib
+import importlib.util
 import operator
 import sys
 import time
@@ -64,7 +65,7 @@ class RecorderNode(Node):
 
         default = f'rosbag2_{datetime.datetime.now():%Y_%m_%d-%H_%M_%S}'
         output = parameter('output', default, 'folder of the bag; it must not exist')
-        names = parameter('topics', [entry.name for entry in TOPICS],
+        names = parameter('topics', [entry.name for entry in TOPICS if _installed(entry.type)],
                           'topics to record: names of the contract, or name:type')
         self.everything = parameter('all', False, 'record whatever is published as well')
         max_bytes = parameter('max_bag_size', 0, 'bytes of a file before the next is begun; '
@@ -275,6 +276,11 @@ class RecorderNode(Node):
         if words not in self.said:
             self.said.add(words)
             self.get_logger().warning(words)
+
+
+def _installed(kind: str) -> bool:
+    """Whether a type's message package is there (tf2_msgs is in no wheel)."""
+    return importlib.util.find_spec(kind.partition('/')[0]) is not None
 
 
 def _message(kind: str) -> type:
