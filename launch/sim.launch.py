@@ -1,17 +1,19 @@
 """Starts the simulated robot and the policy: `ros2 launch vn_nav sim.launch.py`.
 
 Everything stays on this host: the Fast DDS profile knows shared memory and the loopback interface.
+With namespace:=robot2 beside another robot, each has its own world, with its own clock and frames.
 """
 
 from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
+    GroupAction,
     IncludeLaunchDescription,
     SetEnvironmentVariable,
 )
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
+from launch_ros.actions import Node, SetRemap
 from launch_ros.substitutions import FindPackageShare
 
 PASSED_ON = ('namespace', 'use_sim_time', 'params_file', 'autostart', 'use_respawn', 'log_level')
@@ -63,6 +65,10 @@ def generate_launch_description():
         SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile),
         # ROS adds no peers and no interfaces of its own to those of the profile.
         SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SYSTEM_DEFAULT'),
-        bridge,
-        policy,
+        # Absolute names would be those of every robot: into the namespace, for both nodes.
+        GroupAction([
+            *(SetRemap(src=f'/{name}', dst=name) for name in ('clock', 'tf', 'tf_static')),
+            bridge,
+            policy,
+        ]),
     ])

@@ -87,7 +87,8 @@ TOPICS = (
     _history('episode_result', _STRING, 'bridge', 'JSON: outcome of the episode that ended'),
     Topic('goal_pose', 'geometry_msgs/msg/PoseStamped', 'user',
           "a goal by pose, in map or odom; taken by the bridge's ~/reset", depth=1),
-    _sensor('/clock', 'rosgraph_msgs/msg/Clock', 'bridge', 'simulated time'),
+    _sensor('/clock', 'rosgraph_msgs/msg/Clock', 'bridge',
+            'simulated time; of a bridge in a namespace: `clock` in there'),
 )
 
 
