@@ -44,8 +44,8 @@ from vn_sim_bridge.simulated_robot import TICK, TRUNCATED, SimulatedRobot
 COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base brakes
 LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base brakes
 STATEMENT_PATIENCE = 2.0  # s of wall time, see _on_arrived
-# s after which a node has heard of the others on this host (measured: 0.15 to 2.3).
-DISCOVERY = 3.0
+# s after which a node has heard of the others: Fast DDS announces itself every 3 s.
+DISCOVERY = 6.0
 REPORT = 1.0  # s of wall time between two messages on /diagnostics
 BEHIND = 2  # ticks lost between two of them that are worth a warning
 AT_ONCE = 10  # callbacks that are served when a tick is overdue
