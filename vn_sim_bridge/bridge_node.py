@@ -95,7 +95,7 @@ class SimBridgeNode(Node):
         self._clock, self._clock_from = None, created + DISCOVERY
         self._make_interfaces(values)
         self.begin(0)
-        self.begun = self._reported = time.monotonic()
+        self.begun = time.monotonic()
         self._behind_said = 0
 
     def _other_clocks(self) -> list[str]:
