@@ -2,6 +2,7 @@
 
 Everything stays on this host: the Fast DDS profile knows shared memory and the loopback interface.
 The launch ends when one of the two ends: with exit code 1 when it died.
+With namespace:=robot2 beside another robot, each has its own world, with its own clock and frames.
 """
 
 import signal
@@ -9,6 +10,7 @@ import signal
 from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
+    GroupAction,
     IncludeLaunchDescription,
     RegisterEventHandler,
     SetEnvironmentVariable,
@@ -17,7 +19,7 @@ from launch.actions import (
 from launch.event_handlers import OnProcessExit
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
+from launch_ros.actions import Node, SetRemap
 from launch_ros.substitutions import FindPackageShare
 
 BAD_INPUT = 2  # exit code: starting again would not help
@@ -67,9 +69,13 @@ def generate_launch_description():
         SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile),
         # ROS adds no peers and no interfaces of its own to those of the profile.
         SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SYSTEM_DEFAULT'),
-        policy,  # first: it checks the params file
+        # Absolute names would be those of every robot: into the namespace, for both nodes.
+        GroupAction([
+            *(SetRemap(src=f'/{name}', dst=name) for name in ('clock', 'tf', 'tf_static')),
+            policy,  # first: it checks the params file
+            bridge,
+        ]),
         RegisterEventHandler(OnProcessExit(target_action=bridge, on_exit=_on_exit)),
-        bridge,
     ])
 
 

@@ -36,9 +36,11 @@ def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=No
 
 
 @contextlib.contextmanager
-def child(module, log, **parameters):
-    """A node as a process; killed at the end if it still runs."""
+def child(module, log, *, rules=(), **parameters):
+    """A node as a process, with remapping rules; killed at the end if it still runs."""
     words = [sys.executable, '-m', module, '--ros-args']
+    for rule in rules:
+        words += ['-r', rule]
     for name, value in parameters.items():
         words += ['-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}']
     with open(log, 'w') as file:

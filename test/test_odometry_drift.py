@@ -10,7 +10,7 @@ from vn_nav.resources import share_file
 from vn_nav.robot import load_robot
 from vn_sim_bridge.counter_random import Stream, normal
 from vn_sim_bridge.houses.house import clearance
-from vn_sim_bridge.odometry import advance, drift_errors
+from vn_sim_bridge.odometry import Uncertainty, advance, drift_errors
 from vn_sim_bridge.simulated_robot import TICK, SimulatedRobot
 from vn_sim_bridge.tasks import wrap_angle
 
@@ -96,6 +96,46 @@ def test_no_drift_is_the_motion_itself_and_drift_leaves_the_truth_alone(robot):
     assert all(np.array_equal(drifting[k], drifting[k - 1]) for k in still)  # at rest it rests
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(('drift', 'noise'), [(2.0, False), (0.0, True), (1.0, True)])
+def test_odometry_says_how_far_off_it_is(robot, drift, noise):
+    """The covariance against the scatter of 200 drives: a way, a turn, a curve."""
+    spread, robot.noise = [], noise
+    start = np.array([[*robot.middle, 0.0, 0.0]])
+    ticks = [(0.4, 0, 0, 0)] * 10 + [(0, 0, 1.5, 0)] * 12 + [(0.3, 0, 1.0, 0)] * 10
+    for seed in range(200):
+        robot.backend.place(np.array([0]), start.copy())
+        robot.odometry, robot.odometry_drift, robot.seed = np.zeros(3), drift, seed
+        robot.uncertainty, robot.tick_count = Uncertainty(drift, TICK), 0
+        for velocity in ticks:
+            robot.tick(np.array(velocity))
+        off = robot.odometry - robot.pose[:3]
+        off[:2] += robot.middle
+        spread.append([*off[:2], wrap_angle(off[2])])
+    robot.noise = False
+    spread, said = np.cov(np.array(spread).T), robot.uncertainty.pose
+    assert np.sqrt(np.diag(said)) == pytest.approx(np.sqrt(np.diag(spread)), rel=0.2)
+    # Directions too: with the said covariance the scatter is a unit ball, about.
+    white = np.linalg.solve(np.linalg.cholesky(said), np.linalg.cholesky(spread))
+    assert np.linalg.svd(white, compute_uv=False) == pytest.approx(np.ones(3), abs=0.35)
+    assert (np.linalg.eigvalsh(robot.uncertainty.twist) > 0).all()
+
+
+def test_uncertainty_grows_with_the_way_and_not_at_rest(robot):
+    uncertainty = Uncertainty(1.0, TICK)
+    known = uncertainty.pose.copy()
+    assert (np.linalg.eigvalsh(known) > 0).all()
+    sizes = []
+    for _ in range(50):
+        uncertainty.add(0.0, (0.02, 0.0, 0.0))
+        sizes.append(np.trace(uncertainty.pose))
+    assert (np.diff(sizes) > 0).all() and uncertainty.twist[0, 0] > 1e-3
+    driven = uncertainty.pose.copy()
+    uncertainty.rest()
+    assert np.array_equal(uncertainty.pose, driven) and uncertainty.twist[0, 0] < 1e-5
+    assert math.sqrt(driven[0, 0]) == pytest.approx(0.02, rel=0.05)  # of a metre: 2 %
+
+
 def test_the_seed_says_how_it_drifts(robot):
     one, again, other = (circle(robot, 1.0, seed)[0] for seed in (4, 4, 5))
     assert np.array_equal(one, again)
@@ -125,7 +165,7 @@ def test_actions_closed_on_odometry_end_where_they_should(robot, exact):
             ticks, over = 0, False
             while not over:
                 velocity, over = executor.velocity(TICK, robot.odometry)
-                robot.tick(velocity)
+                robot.drive(velocity)
                 ticks += 1
             assert ticks < BASE.nominal_duration(action) / TICK + 12  # it does not creep for ever
             done = math.dist(robot.pose[:2], before[:2])

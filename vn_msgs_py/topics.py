@@ -10,7 +10,11 @@ VOLATILE, LATCHED = 'volatile', 'transient_local'
 
 @dataclasses.dataclass(frozen=True)
 class Topic:
-    """One topic. Quality of service follows REP 2003: sensors best effort, facts latched."""
+    """One topic. Quality of service follows REP 2003: sensors best effort, facts latched.
+
+    It is what a listener asks for. The bridge publishes everything reliably: that serves both
+    kinds of listener.
+    """
 
     name: str
     type: str
@@ -30,7 +34,8 @@ def _latched(name, kind, publisher, meaning):
 
 
 def _history(name, kind, publisher, meaning):
-    # Discovery can take seconds: a recorder that is matched late gets what it missed.
+    # Discovery can take seconds: a recorder that is matched late gets what it missed. For what is
+    # rare and must not be missed: in a stream a newcomer would have to wade through the past.
     return Topic(name, kind, publisher, meaning, RELIABLE, LATCHED, 2000)
 
 
@@ -56,8 +61,11 @@ TOPICS = (
     _latched('arrived', 'std_msgs/msg/Bool', 'policy',
              'true: it says that it has arrived, and stands still; false: it does not, said anew '
              'of every goal'),
-    Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy', 'state and reasons'),
+    Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy, bridge',
+          'state and reasons'),
     _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),
+    _sensor('depth/camera_info', 'sensor_msgs/msg/CameraInfo', 'bridge',
+            'the same camera, for the depth picture'),
     _sensor('labels/image_raw', _IMAGE, 'bridge', 'mono8 class ids'),
     _latched('labels/names', _STRING, 'bridge', 'JSON list: the names behind the class ids'),
     _history('collision', 'std_msgs/msg/Bool', 'bridge',
@@ -65,14 +73,22 @@ TOPICS = (
     _history('reward', 'std_msgs/msg/Float32', 'bridge',
              "at a decision's end: 1 on arrival, else 0"),
     _history('episode_end', 'std_msgs/msg/UInt8', 'bridge', '1 terminated, 2 truncated'),
-    _history('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
-             'true pose in the map, for evaluation; the policy never reads it'),
+    # Deep, so that a recorder keeps up with lock-step.
+    Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
+          'true pose in the map, for evaluation; the policy never reads it', depth=100),
+    _sensor('scan', 'sensor_msgs/msg/LaserScan', 'bridge',
+            'exact, all around, at what the robot would bump into'),
+    Topic('/tf', 'tf2_msgs/msg/TFMessage', 'bridge',
+          'odom to base_link to the camera; needs an installed tf2_msgs', depth=100),
+    _latched('/tf_static', 'tf2_msgs/msg/TFMessage', 'bridge',
+             'base_link to the scanner, the camera to its optical frame'),
     _latched('scene', _STRING, 'bridge', 'JSON: house, rooms, goals, limits, world version'),
     _history('episode', _STRING, 'bridge', 'JSON: goal and start of every episode'),
     _history('episode_result', _STRING, 'bridge', 'JSON: outcome of the episode that ended'),
     Topic('goal_pose', 'geometry_msgs/msg/PoseStamped', 'user',
-          "a goal by pose; taken by the bridge's ~/reset", depth=1),
-    _sensor('/clock', 'rosgraph_msgs/msg/Clock', 'bridge', 'simulated time'),
+          "a goal by pose, in map or odom; taken by the bridge's ~/reset", depth=1),
+    _sensor('/clock', 'rosgraph_msgs/msg/Clock', 'bridge',
+            'simulated time; of a bridge in a namespace: `clock` in there'),
 )
 
 

@@ -1,23 +1,28 @@
-"""`sim_bridge_node`: an embedded house as a robot on ROS topics. It reads Twist alone.
+"""`sim_bridge_node`: an embedded house as a robot on ROS topics. It reads velocities alone.
 
-Run: `ros2 run vn_nav sim_bridge_node --ros-args -p house:=7 -p rooms:=5`.
+Run: `ros2 run vn_nav sim_bridge_node --ros-args -p house:=7 -p rooms:=5`. Two of them on one
+graph: each in a namespace, where its clock is too; nodes that live in its time are told so with
+`-r /clock:=clock` (as `sim.launch.py` does).
 """
 
 from __future__ import annotations
 
+import importlib
 import json
-import math
 import sys
 import time
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, Twist
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped, TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.clock import Clock as NodeClock
+from rclpy.clock import ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, LaserScan
 from std_msgs.msg import Bool, Float32, String, UInt8
 from std_srvs.srv import Trigger
 
@@ -25,47 +30,28 @@ from vn_msgs_py import images, motion
 from vn_nav.errors import UserError
 from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.process import Ended, compiling, run_node
-from vn_nav.nodes.qos import qos
+from vn_nav.nodes.qos import offered, qos
 from vn_nav.robot import RobotSpec, load_robot
-from vn_sim_bridge import tasks
-from vn_sim_bridge.env import STOPS
+from vn_sim_bridge import bridge_messages, bridge_sensors
+from vn_sim_bridge.bridge_messages import Frames
+from vn_sim_bridge.bridge_parameters import PARAMETERS, first_stamp
+from vn_sim_bridge.bridge_sensors import Sensors
 from vn_sim_bridge.goal_pictures import load_goal_pictures
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.randomisation import load_randomisation
 from vn_sim_bridge.simulated_robot import TICK, TRUNCATED, SimulatedRobot
-from vn_sim_bridge.world import WORLD_VERSION
 
-COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base stops
-LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base stops
+COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base brakes
+LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base brakes
 STATEMENT_PATIENCE = 2.0  # s of wall time, see _on_arrived
-OPTICAL_FRAME = 'camera_optical_frame'
-
-# name: (default, meaning, limits), as in `vn_nav.nodes.parameters`.
-PARAMETERS = {
-    'backend': ('house', 'simulator behind the bridge: house', ('house',)),
-    'house': (0, 'seed of the house'),
-    'rooms': (5, 'number of rooms', (1, 12)),
-    'robot': ('', 'YAML file of the robot; empty: the standard robot'),
-    'size': (84, 'side of the square camera picture [pixels]', (16, 1024)),
-    'noise': (True, 'Gaussian motion noise, which odom does not see'),
-    'odometry_drift': (0.0, 'errors of odom: 0 none, 1 as of a good indoor robot, more: worse',
-                       (0.0, 1000.0)),
-    'randomisation': ('none', 'of light, camera and base: none, standard, rough or a YAML file'),
-    'goals': ('', 'folder of goal pictures with their poses (goals.json); empty: the own ones'),
-    'seed': (0, 'of starts, goals and noise'),
-    'time': ('real_time', 'real_time or lock_step (docs/architecture.md, "Time")',
-             ('real_time', 'lock_step')),
-    'mode': ('stop_and_go', 'lock_step: stop_and_go shows pictures at rest, continuous always',
-             ('stop_and_go', 'continuous')),
-    'camera_rate': (10.0, 'pictures per simulated second in real_time and in continuous [Hz]',
-                    (1.0, 1 / TICK)),
-    'episodes': (0, 'episodes to run; 0: without end', (0, 2**31 - 1)),
-    'max_decisions': (300, 'limit of an episode', (1, 2**31 - 1)),
-    'stop': ('arrival', 'what ends an episode before its limit: arrival, or declared: `arrived`',
-             tuple(STOPS)),
-    'start_time': (1.0, 'first stamp [s]; zero would mean "no time yet"', (TICK, 2e9)),
-    'exit_when_done': (False, 'exit after the last episode instead of standing still'),
-}
+# s after which a node has heard of the others: Fast DDS announces itself every 3 s.
+DISCOVERY = 6.0
+REPORT = 1.0  # s of wall time between two messages on /diagnostics
+BEHIND = 2  # ticks lost between two of them that are worth a warning
+AT_ONCE = 10  # callbacks that are served when a tick is overdue
+CLOCK = 'clock'  # a world each, and so a time each: /clock where there is no namespace
+OWN_CLOCK = 'give each robot a namespace (-r __ns:=/robot2), and its nodes -r /clock:=clock'
+TICK_NS = round(TICK * 1e9)
 
 
 class SimBridgeNode(Node):
@@ -73,11 +59,13 @@ class SimBridgeNode(Node):
 
     def __init__(self, ended: Ended):
         super().__init__('sim_bridge_node')
+        created = time.monotonic()
         values = parameters.declare(self, PARAMETERS, read_only=True,
                                     others=policy_parameters.PARAMETERS)
         self.lock_step = values['time'] == 'lock_step'
         self.pictures_in_motion = not self.lock_step or values['mode'] == 'continuous'
         self.continuous = values['mode'] == 'continuous'
+        self.free = values['free_driving']
         self.episodes, self.exit_when_done = values['episodes'], values['exit_when_done']
         self.picture_ticks = max(1, round(1 / (values['camera_rate'] * TICK)))
         robot = load_robot(values['robot']) if values['robot'] else RobotSpec()
@@ -91,94 +79,104 @@ class SimBridgeNode(Node):
                 randomisation=load_randomisation(values['randomisation']),
                 odometry_drift=values['odometry_drift'],
                 goal_poses=[goal.pose for goal in self.goals] or None)
-        self.size, self.start_time = values['size'], values['start_time']
+        self.frames = Frames.with_prefix(values['frame_prefix'])
+        self.start_ns = round(1e9 * first_stamp(
+            values['start_time'], lock_step=self.lock_step, wall=time.time()))
         self.command = np.zeros(4)
         self.command_tick = 0  # when the newest command came, in ticks
+        self.command_at: float | None = None  # the same on the steady clock [s]
         self.command_count = 0
+        self.unanswered = False  # lock-step: nobody has sent a command for a while
+        self.rest_ticks = 0  # since it came to rest
         self.next_goal = None  # pose from the goal_pose topic, for the next reset
         self.done = False
         self.says_arrived = self.goal_taken = False  # the policy, in this episode
         self.goal_shown = 0.0  # steady time [s]
-        self._make_interfaces()
+        self._clock, self._clock_from = None, created + DISCOVERY
+        self._make_interfaces(values)
         with compiling(self, ended, work):
-            self.begin_episode(0)
+            self.begin(0)
         self.get_logger().info(
             f'ready: house {values["house"]}, {values["time"]}; pictures on '
-            f'{self._image.topic_name}, waits for commands on '
-            f'{self.resolve_topic_name("cmd_vel")}')
+            f'{self.resolve_topic_name("image_raw")}, waits for commands on '
+            f'{self._listener.topic_name}')
+        self.begun = time.monotonic()
+        self._behind_said = 0
 
-    def _make_interfaces(self) -> None:
+    def _other_clocks(self) -> list[str]:
+        """Who else publishes on the clock's topic."""
+        me = (self.get_name(), self.get_namespace())
+        return sorted({f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                       for info in self.get_publishers_info_by_topic(
+                           self.resolve_topic_name(CLOCK))
+                       if (info.node_name, info.node_namespace) != me})
+
+    def _publish_clock(self, stamp: Time) -> None:
+        """Say the time, as soon as it is clear that nobody else does.
+
+        Raises:
+            UserError: somebody else does: this node, the newcomer, ends.
+        """
+        if self._clock is None:
+            if time.monotonic() < self._clock_from:
+                return
+            if others := self._other_clocks():
+                raise UserError('one node alone publishes the simulated time',
+                                f'{", ".join(others)} on {self.resolve_topic_name(CLOCK)}',
+                                OWN_CLOCK)
+            self._clock = self.create_publisher(Clock, CLOCK, offered('/clock'))
+        self._clock.publish(Clock(clock=stamp))
+
+    def _make_interfaces(self, values: dict) -> None:
         def publisher(kind, name):
-            return self.create_publisher(kind, name, qos(name))
+            return self.create_publisher(kind, name, offered(name))
 
-        self._image = publisher(Image, 'image_raw')
-        self._camera_info = publisher(CameraInfo, 'camera_info')
-        self._depth = publisher(Image, 'depth/image_raw')
-        self._labels = publisher(Image, 'labels/image_raw')
+        kinds = dict(zip(bridge_sensors.TOPICS, (
+            Image, CompressedImage, CameraInfo, Image, CameraInfo, Image, LaserScan, Odometry,
+            Odometry), strict=True))
+        try:  # in no wheel
+            transforms = importlib.import_module('tf2_msgs.msg').TFMessage
+            kinds |= {'/tf': transforms, '/tf_static': transforms}
+        except ModuleNotFoundError:
+            self.get_logger().info('no /tf: tf2_msgs is not installed')
+        self._sensors = Sensors(
+            {name: publisher(kind, name) for name, kind in kinds.items()}, self.robot,
+            self.frames, size=values['size'], period=self.picture_ticks * TICK,
+            localised=values['localised'], transform=TransformStamped)
         self._label_names = publisher(String, 'labels/names')
-        self._goal_image = publisher(Image, 'goal_image')
-        self._odometry = publisher(Odometry, 'odom')
-        self._truth = publisher(Odometry, 'ground_truth/odom')
         self._collision = publisher(Bool, 'collision')
-        self._reward = publisher(Float32, 'reward')
-        self._episode_end = publisher(UInt8, 'episode_end')
         self._scene = publisher(String, 'scene')
-        self._episode = publisher(String, 'episode')
-        self._episode_result = publisher(String, 'episode_result')
-        self._clock = publisher(Clock, '/clock')
-        self.create_subscription(Twist, 'cmd_vel', self._on_command, qos('cmd_vel'))
+        self._diagnostics = publisher(DiagnosticArray, '/diagnostics')
+        if not self.free:
+            self._goal_image = publisher(Image, 'goal_image')
+            self._reward = publisher(Float32, 'reward')
+            self._episode_end = publisher(UInt8, 'episode_end')
+            self._episode = publisher(String, 'episode')
+            self._episode_result = publisher(String, 'episode_result')
+        self._listener = self.create_subscription(
+            TwistStamped if values['enable_stamped_cmd_vel'] else Twist, 'cmd_vel',
+            self._on_command, qos('cmd_vel'))
         self.create_subscription(PoseStamped, 'goal_pose', self._on_goal_pose, qos('goal_pose'))
         if self.robot.stop_rule == 'declared':
             # Deeper than the contract: what is said of one goal and of the next are both heard.
             self.create_subscription(Bool, 'arrived', self._on_arrived, qos('arrived', depth=10))
         self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_timer(REPORT, self._report, clock=NodeClock(clock_type=ClockType.STEADY_TIME))
         self._label_names.publish(String(data=json.dumps(list(LABELS))))
-        self._scene.publish(String(data=json.dumps(self._scene_facts())))
-        self._info_message = self._make_camera_info()
-        self._odometry_message, self._truth_message = Odometry(), Odometry()
-        self._odometry_message.header.frame_id = 'odom'
-        self._truth_message.header.frame_id = 'map'
-        for message in (self._odometry_message, self._truth_message):
-            message.child_frame_id = 'base_link'
-
-    def _scene_facts(self) -> dict:
-        """What a viewer or a report needs to draw the house."""
-        house = self.robot.house
-        return {
-            'world_version': WORLD_VERSION,
-            'rooms': len(house.rooms),
-            **house.floor_plan(),
-            'goals': [{'room': field.goal.room, 'pose': list(field.goal.pose)}
-                      for field in self.robot.fields],
-            'arrival': {'radius': tasks.ARRIVAL_RADIUS,
-                        'heading_deg': math.degrees(tasks.ARRIVAL_HEADING)},
-            'camera_fov_deg': math.degrees(self.robot.robot.camera_fov),
-            'stop': self.robot.stop_rule,
-            'max_decisions': self.robot.max_decisions,
-            'tick': TICK,
-        }
-
-    def _make_camera_info(self) -> CameraInfo:
-        focal = self.size / 2 / math.tan(self.robot.robot.camera_fov / 2)
-        centre = self.size / 2
-        info = CameraInfo(width=self.size, height=self.size, distortion_model='plumb_bob')
-        info.header.frame_id = OPTICAL_FRAME
-        info.d = [0.0] * 5
-        info.k = [focal, 0.0, centre, 0.0, focal, centre, 0.0, 0.0, 1.0]
-        info.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-        info.p = [focal, 0.0, centre, 0.0, 0.0, focal, centre, 0.0, 0.0, 0.0, 1.0, 0.0]
-        return info
+        self._scene.publish(String(data=json.dumps(bridge_messages.scene_facts(self.robot))))
+        self._sensors.publish_mounts(self.stamp())
 
     # What comes in.
 
-    def _on_command(self, message: Twist) -> None:
+    def _on_command(self, message: Twist | TwistStamped) -> None:
         try:
             self.command = motion.twist_to_array(message)
         except motion.MotionError as error:
             self.command = np.zeros(4)
             self.get_logger().error(f'stopped: {error}', throttle_duration_sec=1.0)
-        self.command_tick = self.robot.tick_count
+        self.command_tick, self.command_at = self.robot.tick_count, time.monotonic()
         self.command_count += 1
+        self.unanswered = False
 
     def _on_arrived(self, message: Bool) -> None:
         """What the robot says. It may still mean the goal before.
@@ -194,44 +192,64 @@ class SimBridgeNode(Node):
             self.goal_taken or time.monotonic() - self.goal_shown > STATEMENT_PATIENCE)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
-        q = message.pose.orientation
-        self.next_goal = (message.pose.position.x, message.pose.position.y,
-                          motion.quaternion_to_yaw(q.x, q.y, q.z, q.w))
+        if self.free:
+            self.get_logger().warning('goal_pose is ignored: free_driving has no goals')
+            return
+        try:
+            self.next_goal = bridge_messages.goal_in_map(
+                message, self.frames, self.robot.pose, self.robot.odometry)
+        except UserError as error:
+            self.get_logger().error(f'goal_pose is ignored: {error}', throttle_duration_sec=1.0)
 
     def _on_reset(self, _request, response):
         """A new episode; towards the newest goal_pose, if one came since the last reset."""
         goal, self.next_goal = self.next_goal, None
         try:
-            self.begin_episode(self.robot.episode.index + 1, goal)
+            self.begin(self.index + 1, goal)
         except UserError as error:
             response.success, response.message = False, str(error)
             return response
         self.done = False
         response.success = True
-        response.message = f'episode {self.robot.episode.index} towards {self.robot.goal.room}'
+        response.message = f'start {self.index}' if self.free else (
+            f'episode {self.index} towards {self.robot.goal.room}')
         return response
 
     # What goes out.
 
-    def stamp(self) -> Time:
+    @property
+    def nanoseconds(self) -> int:
         """The simulated time."""
-        nanoseconds = round((self.start_time + self.robot.time) * 1e9)
-        return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
+        return self.start_ns + TICK_NS * self.robot.tick_count
 
-    def begin_episode(self, index: int, goal_pose=None) -> None:
-        """Move the robot to a new start and show the new goal."""
-        episode = self.robot.begin_episode(index, goal_pose)
+    def stamp(self) -> Time:
+        """The simulated time as a stamp."""
+        return Time(sec=self.nanoseconds // 10**9, nanosec=self.nanoseconds % 10**9)
+
+    def begin(self, index: int, goal_pose=None) -> None:
+        """Move the robot to a new start; in episodes, show the new goal.
+
+        Raises:
+            UserError: a goal where the robot cannot stand; nothing has changed.
+        """
+        if self.free:
+            self.robot.place_freely(index)
+        else:
+            self.robot.begin_episode(index, goal_pose)
+        self.index = index
         self.command = np.zeros(4)
+        self.rest_ticks = -1  # its first picture waits for a tick, see `tick`
         self.says_arrived = self.goal_taken = False
         self.goal_shown = time.monotonic()
+        if not self.free:
+            self._show_goal()
+
+    def _show_goal(self) -> None:
         message = images.fill_image(Image(), self._goal_picture(), 'rgb8')
         message.header.stamp = self.stamp()
-        message.header.frame_id = OPTICAL_FRAME
-        self._episode.publish(String(data=json.dumps({
-            'episode': episode.index, 'goal': episode.goal, 'room': self.robot.goal.room,
-            'goal_pose': list(self.robot.goal.pose), 'start': list(episode.start),
-            'start_distance': episode.start_distance, 'stamp': self.start_time + episode.begun_at,
-            'max_decisions': self.robot.max_decisions})))
+        message.header.frame_id = self.frames.optical
+        self._episode.publish(String(data=json.dumps(
+            bridge_messages.episode_facts(self.robot, self.nanoseconds * 1e-9))))
         self._goal_image.publish(message)
 
     def _goal_picture(self) -> np.ndarray:
@@ -241,40 +259,55 @@ class SimBridgeNode(Node):
             return self.goals[goal].picture
         return np.ascontiguousarray(self.robot.goal_frames().rgb[0].transpose(1, 2, 0))
 
+    @property
+    def moves(self) -> bool:
+        """A velocity is asked for, or the base still brakes."""
+        return bool(self.command.any() or self.robot.velocity.any())
+
+    def give_up_waiting(self) -> None:
+        """In lock-step nobody has answered: the base brakes, and time goes on."""
+        self.command, self.unanswered = np.zeros(4), True
+        self.get_logger().warning('no command for 2 s in motion: the base brakes')
+
     def tick(self) -> None:
         """Advance by one tick under the command in force, and publish what follows."""
         stale = (self.robot.tick_count - self.command_tick) * TICK >= COMMAND_TIMEOUT
         declares = self._declares()
         if stale or declares:
             self.command = np.zeros(4)
-        decision = self.robot.tick(self.command)
-        shows_picture = self.robot.tick_count % self.picture_ticks == 0
-        if self.continuous and shows_picture and self.robot.in_decision:
+        decision = self.robot.drive(self.command)
+        camera_due = self.robot.tick_count % self.picture_ticks == 0
+        if self.continuous and camera_due and self.robot.in_decision:
             decision = self.robot.end_decision()
         stamp = self.stamp()
+        at_rest = not self.robot.velocity.any()
+        self.rest_ticks = self.rest_ticks + 1 if at_rest else -1
         begun = decision is not None and self._judge(decision)
-        if declares and not begun and self.robot.episode is not None:
+        # Who says that it has arrived is judged where it has come to rest.
+        if declares and at_rest and not begun and self.robot.episode is not None:
             begun = self._judge(self.robot.declare())
-        self._clock.publish(Clock(clock=stamp))
+        self._publish_clock(stamp)
+        if not self.pictures_in_motion:  # the first in the very tick that comes to rest
+            camera_due = at_rest and self.rest_ticks % self.picture_ticks == 0
         # After a jump to a new start the first picture waits for a tick, so that the new goal
         # arrives before it.
-        at_rest = not self.robot.velocity.any()
-        if not begun and (at_rest or (self.pictures_in_motion and shows_picture)):
-            self._publish_pictures(stamp)
-        self._publish_odometry(stamp)
+        if camera_due and not begun:
+            self._sensors.publish_pictures(stamp)
+        if self.robot.tick_count % self.picture_ticks == 0:
+            self._sensors.publish_scan(stamp)
+        self._sensors.publish_odometry(stamp)
 
     def _judge(self, decision) -> bool:
         """Publish a decision's outcome; True when a new episode began."""
         self._collision.publish(Bool(data=decision.collided))
+        if self.free:
+            return False
         self._reward.publish(Float32(data=float(decision.success)))
         if not decision.end:
             return False
         episode = self.robot.episode
-        self._episode_result.publish(String(data=json.dumps({
-            'episode': episode.index, 'success': decision.success,
-            'decisions': episode.decisions, 'collisions': episode.collisions,
-            'path_length': episode.path_length, 'distance': decision.distance,
-            'heading_error_deg': math.degrees(decision.heading_error)})))
+        self._episode_result.publish(String(data=json.dumps(
+            bridge_messages.result_facts(episode, decision))))
         self._episode_end.publish(UInt8(data=decision.end))
         outcome = ('gave up' if decision.end == TRUNCATED else
                    'arrived' if decision.success else 'stopped elsewhere')
@@ -285,32 +318,50 @@ class SimBridgeNode(Node):
             self.done = True
             self.robot.episode = None
             return True
-        self.begin_episode(episode.index + 1)
+        self.begin(episode.index + 1)
         return True
 
-    def _publish_pictures(self, stamp: Time) -> None:
-        frames = self.robot.observe()
-        self._info_message.header.stamp = stamp
-        self._camera_info.publish(self._info_message)
-        streams = [(self._image, frames.rgb[0].transpose(1, 2, 0), 'rgb8')]
-        if self._depth.get_subscription_count():
-            streams.append((self._depth, frames.depth[0], '32FC1'))
-        if self._labels.get_subscription_count():
-            streams.append((self._labels, frames.labels[0], 'mono8'))
-        for publisher, picture, encoding in streams:
-            message = images.fill_image(Image(), np.ascontiguousarray(picture), encoding)
-            message.header.stamp = stamp
-            message.header.frame_id = OPTICAL_FRAME
-            publisher.publish(message)
+    def _report(self) -> None:
+        """Say on /diagnostics how the simulated robot does."""
+        now = time.monotonic()
+        behind = 0 if self.lock_step else max(
+            0, int((now - self.begun) / TICK) - self.robot.tick_count)
+        state = ('all episodes done' if self.done else 'free driving' if self.free else
+                 f'episode {self.index} to {self.robot.goal.room}')
+        level, words = DiagnosticStatus.OK, state
+        if behind >= self._behind_said + BEHIND:
+            level, words = DiagnosticStatus.WARN, (
+                f'{state}: {behind - self._behind_said} ticks of {TICK} s late since the last '
+                'report: give it more time, smaller pictures or lock_step')
+        self._behind_said = behind
+        if fault := self._misunderstandings():
+            level, words = DiagnosticStatus.ERROR, fault
+            self.get_logger().error(fault, throttle_duration_sec=10.0)
+        values = {
+            'state': state, 'episode': self.index,
+            'decisions': self.robot.episode.decisions if self.robot.episode else 0,
+            'moves': self.moves, 'ticks': self.robot.tick_count, 'ticks_behind': behind,
+            'last_command_age': ('no command yet' if self.command_at is None else
+                                 f'{now - self.command_at:.2f}')}
+        message = DiagnosticArray(status=[DiagnosticStatus(
+            level=level, name=self.get_fully_qualified_name(), message=words,
+            hardware_id=self.robot.robot.name,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+        message.header.stamp = self.stamp()
+        self._diagnostics.publish(message)
 
-    def _publish_odometry(self, stamp: Time) -> None:
-        velocity = self.robot.velocity
-        self._odometry_message.header.stamp = stamp
-        self._truth_message.header.stamp = stamp
-        x, y, yaw = self.robot.odometry
-        tx, ty, true_yaw, _ = self.robot.pose
-        self._truth.publish(motion.fill_odometry(self._truth_message, tx, ty, true_yaw, velocity))
-        self._odometry.publish(motion.fill_odometry(self._odometry_message, x, y, yaw, velocity))
+    def _misunderstandings(self) -> str:
+        """Another clock, or commands of the type that this base does not read."""
+        if self._clock is not None and (others := self._other_clocks()):
+            return (f'{", ".join(others)} also publishes on {self._clock.topic_name}: time jumps; '
+                    f'{OWN_CLOCK}')
+        mine = f'geometry_msgs/msg/{self._listener.msg_type.__name__}'
+        for info in self.get_publishers_info_by_topic(self._listener.topic_name):
+            if info.topic_type != mine:
+                other = str(mine == 'geometry_msgs/msg/Twist').lower()
+                return (f'{info.node_name} sends {info.topic_type} where this base reads {mine}: '
+                        f'set enable_stamped_cmd_vel to {other}')
+        return ''
 
 
 def run(node: SimBridgeNode, ended: Ended) -> None:
@@ -328,18 +379,20 @@ def run(node: SimBridgeNode, ended: Ended) -> None:
                 executor.spin_once(timeout_sec=0.05)
             return
         answered = node.command_count
-        moving = bool(node.command.any())
-        now = time.monotonic()
+        moving, now = node.moves, time.monotonic()
+        waits = node.lock_step and moving and not node.unanswered
         if node.lock_step:
-            next_tick = now + (LOCK_STEP_TIMEOUT if moving else TICK)
+            next_tick = now + (LOCK_STEP_TIMEOUT if waits else TICK)
         else:
-            next_tick = max(next_tick + TICK, now)  # late ticks are caught up, not skipped
+            next_tick = max(next_tick + TICK, now)  # no tick is left out: time falls behind
+        if next_tick <= now:  # a late bridge still hears a stop
+            for _ in range(AT_ONCE):
+                executor.spin_once(timeout_sec=0)
         while not ended.is_set():
             remaining = next_tick - time.monotonic()
             if remaining <= 0:
-                if node.lock_step and moving:
-                    node.command = np.zeros(4)
-                    node.get_logger().warning('no command for 2 s in motion: the base stops')
+                if waits:
+                    node.give_up_waiting()
                 break
             executor.spin_once(timeout_sec=min(remaining, 0.2))
             if node.lock_step and node.command_count > answered and (

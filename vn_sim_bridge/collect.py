@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
+from vn_msgs_py.camera import intrinsics
 from vn_msgs_py.motion import yaw_to_quaternion
 from vn_msgs_py.topics import Topic, topic
 from vn_nav.errors import UserError
@@ -229,13 +230,11 @@ class _Bag:
                     step=len(data) // height, data=data)
 
     def _write_camera_info(self, height: int, width: int) -> None:
-        focal = height / 2 / math.tan(self._robot.camera_fov / 2)
-        x, y = width / 2, height / 2
+        k, p = intrinsics(width, height, self._robot.camera_fov)
         self._write(
             'camera_info', header=self._stamped(OPTICAL_FRAME), height=height, width=width,
             distortion_model='plumb_bob', d=np.zeros(5),
-            k=np.array([focal, 0, x, 0, focal, y, 0, 0, 1.0]), r=np.eye(3).reshape(-1),
-            p=np.array([focal, 0, x, 0, 0, focal, y, 0, 0, 0, 1.0, 0]), binning_x=0, binning_y=0,
+            k=np.array(k), r=np.eye(3).reshape(-1), p=np.array(p), binning_x=0, binning_y=0,
             roi=self._make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0,
                            width=0, do_rectify=False))
 

@@ -13,15 +13,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_nav.robot import RobotSpec
+from vn_nav.robot import AXES, RobotSpec
 from vn_sim_bridge import tasks
 from vn_sim_bridge.backends.base import Frames
 from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.houses.house import Goal
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.odometry import advance, drift_errors
+from vn_sim_bridge.odometry import Uncertainty, advance, drift_errors
 from vn_sim_bridge.randomisation import Randomisation
+from vn_sim_bridge.simulated_base import SimulatedBase
 from vn_sim_bridge.world import motion_noise, nominal_sizes
 
 TICK = 0.05  # s of simulated time
@@ -91,7 +92,9 @@ class SimulatedRobot:
         self.tick_count = 0
         self.odometry_drift = odometry_drift
         self.odometry = np.zeros(3)  # x, y, yaw in the odom frame
-        self.velocity = np.zeros(4)  # of the last tick: vx, vy, wz, tilt rate
+        self.uncertainty = Uncertainty(odometry_drift, TICK)  # of the odometry
+        self.base = SimulatedBase(robot, TICK)
+        self.velocity = np.zeros(4)  # of the body in the last tick: vx, vy, wz, tilt rate
         self.episode: Episode | None = None
         self._field = self.fields[0]
         self._in_decision = False
@@ -135,6 +138,8 @@ class SimulatedRobot:
         self._field = field
         start = field.start(1.0, *counter)
         self.backend.place(np.array([0]), start[None])
+        self.base.stop()
+        self.velocity = np.zeros(4)
         self._in_decision = self._touched = False
         self.backend.dress(np.array([0]), self.seed, Stream.APPEARANCE, index, 0)
         low, high = self.randomisation.motion_scale
@@ -144,6 +149,11 @@ class SimulatedRobot:
         self.episode = Episode(index, chosen, tuple(float(v) for v in start),
                                self.distance(), self.time)
         return self.episode
+
+    def place_freely(self, index: int) -> None:
+        """Put the robot at the start of episode `index`, to be driven without any episode."""
+        self.begin_episode(index)
+        self.episode = None
 
     def _field_at(self, x: float, y: float, yaw: float) -> tasks.GoalField:
         centres = self.house.floor.centres()
@@ -179,8 +189,21 @@ class SimulatedRobot:
         """Geodesic distance to the goal [m]."""
         return float(self._field.field.distance(self.pose[None, :2])[0])
 
+    def drive(self, command: np.ndarray) -> Decision | None:
+        """Advance by one tick as the base follows a command, within the robot's limits.
+
+        Args:
+            command: [4] vx, vy [m/s], wz, tilt rate [rad/s], finite.
+
+        Returns:
+            As `tick`: the robot is at rest when nothing is asked for and it has braked.
+        """
+        command = np.asarray(command, float)
+        velocity = self.base.follow(command, self.velocity)
+        return self._advance(velocity, at_rest=not (velocity.any() or command.any()))
+
     def tick(self, velocity: np.ndarray) -> Decision | None:
-        """Advance by one tick with a velocity in force.
+        """Advance by one tick at a velocity, whatever the limits: a whole action may be one tick.
 
         Args:
             velocity: [4] vx, vy [m/s], wz, tilt rate [rad/s].
@@ -188,9 +211,15 @@ class SimulatedRobot:
         Returns:
             The judgement, when this tick ended a decision: the first tick at rest after motion.
         """
+        velocity = np.asarray(velocity, float)
+        self.base.velocity = velocity.copy()
+        return self._advance(velocity, at_rest=not velocity.any())
+
+    def _advance(self, velocity: np.ndarray, *, at_rest: bool) -> Decision | None:
         self.tick_count += 1
-        self.velocity = np.asarray(velocity, float)
-        if not self.velocity.any():
+        self.velocity = velocity.copy()
+        if at_rest:
+            self.uncertainty.rest()
             return self.end_decision() if self._in_decision else None
         if not self._in_decision:
             self._in_decision = True
@@ -208,6 +237,8 @@ class SimulatedRobot:
         # Odometry counts wheel turns: what was wanted, as far as nothing stood in the way.
         share = travelled / length if length > 0 else 1.0
         turned = share * wanted[0], share * wanted[1], wanted[2]
+        self.uncertainty.add(self.odometry[2], turned, noise=float(
+            np.abs(wanted[:3]).max() / self._nominal_size(wanted)) if self.noise else 0.0)
         self.odometry = advance(self.odometry, turned, self._odometry_errors(turned))
         self.velocity[:2] *= share
         return None
@@ -221,14 +252,17 @@ class SimulatedRobot:
         return float(key(*counter) % np.uint64(1000)) / 1000.0
 
     def _with_noise(self, wanted: np.ndarray) -> np.ndarray:
-        axis = int(np.argmax(np.abs(wanted)))
-        name = ('+' if wanted[axis] > 0 else '-') + ('dx', 'dy', 'dyaw', 'dpitch')[axis]
-        # A direction without an action of its own (a joystick driving sideways) is as noisy as
-        # the thesis's largest step.
-        nominal = self._nominal.get(name, 0.5)
         number = normal(self.seed, Stream.MOTION_NOISE, 0, self.episode.index if self.episode
                         else 0, self.tick_count)
-        return motion_noise(wanted[None], np.array([nominal]), np.atleast_1d(number))[0]
+        return motion_noise(wanted[None], np.array([self._nominal_size(wanted)]),
+                            np.atleast_1d(number))[0]
+
+    def _nominal_size(self, wanted: np.ndarray) -> float:
+        """Of the whole action [m or rad] that a displacement [4] is a part of."""
+        axis = int(np.argmax(np.abs(wanted)))
+        # A direction without an action of its own (a joystick driving sideways) is as noisy as
+        # the thesis's largest step.
+        return self._nominal.get(('+' if wanted[axis] > 0 else '-') + AXES[axis], 0.5)
 
     def _odometry_errors(self, turned: tuple[float, float, float]) -> tuple[float, float, float]:
         if not self.odometry_drift:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from vn_msgs_py.topics import BEST_EFFORT, LATCHED, Topic, topic
+from vn_msgs_py.topics import BEST_EFFORT, LATCHED, RELIABLE, Topic, topic
 
 
 def qos(name: str, *, depth: int | None = None) -> QoSProfile:
@@ -67,3 +68,12 @@ def other_types(node, name: str, kind: type) -> list[tuple[str, str]]:
     wanted = f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
     return [(info.node_name, info.topic_type)
             for info in node.get_publishers_info_by_topic(name) if info.topic_type != wanted]
+
+
+def offered(name: str) -> QoSProfile:
+    """What a publisher of this package offers: reliable, also where a listener asks for less.
+
+    Best effort is served by a reliable publisher as well; a listener that insists on reliable (an
+    RViz display) would get nothing from a best-effort one.
+    """
+    return profile(dataclasses.replace(topic(name), reliability=RELIABLE))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import importlib
+import importlib.util
 import operator
 import sys
 import time
@@ -32,11 +33,21 @@ POLL = 0.005  # s between looks at the subscriptions when there was nothing
 LOOK = 0.2  # s between looks at who publishes
 REPORT = 1.0  # s
 TWIN = {'geometry_msgs/msg/Twist': 'geometry_msgs/msg/TwistStamped'}  # accepted in its place
+COMPRESSED = 'image_raw/compressed'  # a bag needs a picture once: only where there is no raw one
+
+
+def _installed(kind: str) -> bool:
+    """Whether a type's message package is there (tf2_msgs is in no wheel)."""
+    return importlib.util.find_spec(kind.partition('/')[0]) is not None
+
+
 # name: (default, meaning, limits), as in `vn_nav.nodes.parameters`.
 PARAMETERS = {
     'output': ('', 'folder of the bag; it must not exist; empty: rosbag2_ and the date'),
-    'topics': ([entry.name for entry in TOPICS],
-               'topics to record: names of the contract, or name:type'),
+    'topics': ([entry.name for entry in TOPICS
+                if _installed(entry.type) and entry.name != COMPRESSED],
+               'topics to record: names of the contract, or name:type; left as it is: also '
+               f'{COMPRESSED} where nobody publishes raw pictures'),
     'all': (False, 'record whatever is published as well'),
     'max_bag_size': (0, 'bytes of a file before the next is begun; 0: no limit', (0, 1 << 50)),
     'max_bag_duration': (0.0, 'seconds of a file before the next is begun; 0: no limit',
@@ -71,6 +82,7 @@ class RecorderNode(Node):
                                    others=policy_parameters.PARAMETERS)
         output = value['output'] or f'rosbag2_{datetime.datetime.now():%Y_%m_%d-%H_%M_%S}'
         self.everything = value['all']
+        self.compressed_instead = value['topics'] == PARAMETERS['topics'][0]
         self.awaited: dict[str, str] = {}  # type by resolved name
         self.refused: set[str] = set()  # resolved names
         entries = [entry for entry in map(self._wanted, value['topics']) if entry is not None]
@@ -187,6 +199,10 @@ class RecorderNode(Node):
         """Follow the publishers: their types, their quality of service, new topics."""
         for tap in list(self.taps.values()):
             self._follow(tap)
+        if self.compressed_instead and self._offers(self.resolve_topic_name(COMPRESSED)) and not (
+                self._offers(self.resolve_topic_name('image_raw'))):
+            self.compressed_instead = False
+            self._listen(topic(COMPRESSED))
         if self.everything:
             for name, kinds in self.get_topic_names_and_types():
                 if not (name in self.taps or name in self.refused or _hidden(name)):
