@@ -84,7 +84,7 @@ setup(
         # Wheels for x86-64 machines without ROS. Where Jazzy is installed they come from apt.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'train': ['tensorboard>=2.16'],
-        'mesh': ['trimesh>=4.5', 'pillow>=10'],  # OBJ, GLB and glTF in and out
+        'mesh': ['pillow>=10'],  # the textures of OBJ, GLB and glTF files
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`
         'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels
@@ -93,6 +93,7 @@ setup(
             'pytest-timeout>=2.3',
             'pytest-xdist>=3.6',  # what computes uses all cores
             'hypothesis>=6.100',
+            'trimesh>=4.5',  # reads our GLB with other code than ours
             'pymcap-cli>=0.34',  # a judge of our bags that shares no code with us
             'ruff>=0.6',
             'ros-jazzy-ament-flake8',

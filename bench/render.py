@@ -99,7 +99,8 @@ def city(scene: Scene, triangles: int, spacing: float) -> Scene:
 
 def subdivided(scene: Scene, triangles: int) -> Scene:
     """The same surfaces in about so many triangles, all of which can be seen."""
-    from vn_sim_bridge.houses.mesh import export_mesh, load_mesh
+    from vn_sim_bridge.houses.mesh import load_mesh
+    from vn_sim_bridge.houses.mesh_export import export_mesh
     with tempfile.TemporaryDirectory() as folder:
         import trimesh
         path = Path(folder) / 'house.glb'

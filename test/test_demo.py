@@ -10,6 +10,11 @@ from ros_harness import write_checkpoint
 from rosbags.highlevel import AnyReader
 
 from vn_nav.cli import main
+from vn_nav.cli_world import make_env
+from vn_nav.demo import SEED, control_env
+from vn_nav.evaluation.bag_episodes import drives_from_bag
+from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.resources import share_file
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(240)]  # drives over ROS
 
@@ -105,3 +110,20 @@ def test_the_bridges_own_account_agrees(demo):
             own.append(json.loads(reader.deserialize(data, connection.msgtype).data))
     for said, seen in zip(own, counted(demo / 'bag'), strict=True):
         assert (said['success'], said['decisions'], said['collisions']) == seen[1:4]
+
+
+def test_the_control_without_ros_is_shown_the_goal_pictures_of_the_bag(demo):
+    checkpoint = load_checkpoint(share_file('models/house'))
+    for place, (drive, house, limit) in zip(
+            ('trained', 'unseen'), zip(drives_from_bag(demo / 'bag', pictures=True), (7, 8),
+                                       (300, 100), strict=True), strict=True):
+        env = control_env(make_env, checkpoint, house, len(drive.episodes), limit)
+        seen, info = env.reset(seed=SEED)
+        for k, recorded in enumerate(drive.episodes):
+            np.testing.assert_array_equal(recorded.goal_picture.transpose(2, 0, 1),
+                                          env.goals[seen['goal_index'][k]], err_msg=place)
+            assert recorded.facts['start'] == info['pose'][k].tolist()
+            # The recorder may meet the camera (best effort) only after the first pictures.
+            numbers = list(range(1, recorded.episode.decisions + 1))
+            assert list(recorded.pictures) == numbers[-len(recorded.pictures):]
+            assert len(numbers) - len(recorded.pictures) <= (2 if k == 0 else 0)

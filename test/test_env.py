@@ -3,11 +3,15 @@
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from vn_nav.errors import UserError
 from vn_sim_bridge.env import EnvConfig, HouseNavigation, NavigationEnv
+from vn_sim_bridge.randomisation import load_randomisation
 from vn_sim_bridge.tasks import ARRIVAL_HEADING, ARRIVAL_RADIUS
+
+STANDARD = load_randomisation('standard')
 
 
 def make(**options):
@@ -25,6 +29,73 @@ def test_the_single_environment_passes_gymnasiums_checks():
     env = gymnasium.make('vn_nav/House-v0', house=3, size=36, render_mode='rgb_array')
     observation, _ = env.reset(seed=1)
     assert np.array_equal(env.render(), observation['image'].transpose(1, 2, 0))
+
+
+def test_the_specification_is_json_and_makes_the_same_environment():
+    env = gymnasium.make('vn_nav/House-v0', house=3, size=36, randomisation='standard',
+                         privileged=('depth',), actions=('forward', 'rotate_left'))
+    again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    (one, told), (two, also) = (made.reset(seed=5) for made in (env, again))
+    assert np.array_equal(one['image'], two['image']) and np.array_equal(one['goal'], two['goal'])
+    assert again.action_space.n == 2 and np.array_equal(told['depth'], also['depth'])
+
+
+def alike(one, two, rows, others):
+    return all(np.array_equal(one[key][rows], two[key][others]) for key in one)
+
+
+def test_a_list_of_seeds_gives_each_environment_its_own():
+    env, single = make(num_envs=3, randomisation=STANDARD), make(num_envs=1,
+                                                                 randomisation=STANDARD)
+    seeds = [11, 5, 11]
+    observation, info = env.reset(seed=seeds)
+    assert info['reset'].all()
+    state = env.get_state()
+    act = random_actions(env)
+    chosen = [act() for _ in range(12)]
+    chosen = [np.array([a[0], a[1], a[0]]) for a in chosen]
+    seen = [observation] + [env.step(actions)[0] for actions in chosen]
+    for k in range(3):  # as a single environment with that seed
+        alone = [single.reset(seed=seeds[k])[0]] + [single.step(a[k:k + 1])[0] for a in chosen]
+        assert all(alike(one, two, k, 0) for one, two in zip(seen, alone, strict=True))
+    env.reset(seed=1)
+    env.set_state(state)
+    assert all(alike(env.step(a)[0], later, slice(None), slice(None))
+               for a, later in zip(chosen, seen[1:], strict=True))
+    env.reset(seed=[None, 7, None])  # the others go on with their own
+    env.reset(seed=np.array([1, 2, 3]))
+    for wrong in ([1, 2], [1, 2, 3, 4], [1, 2, 'x'], [1, 2, 3.5], -1, 'x'):
+        with pytest.raises(UserError, match='seed'):
+            env.reset(seed=wrong)
+
+
+def test_a_reset_mask_leaves_the_others_where_they_are():
+    env, other = (make(max_decisions=30, randomisation=STANDARD) for _ in range(2))
+    env.reset(seed=3)
+    other.reset(seed=3)
+    act = random_actions(env)
+    for _ in range(5):
+        actions = act()
+        before, *_, told = env.step(actions)
+        other.step(actions)
+    mask = np.array([False, True, False, True])
+    after, info = env.reset(options={'reset_mask': mask})
+    assert info['reset'].tolist() == mask.tolist()
+    assert info['decisions'].tolist() == [5, 0, 5, 0]
+    assert alike(before, after, ~mask, ~mask)
+    assert np.array_equal(info['pose'][~mask], told['pose'][~mask])
+    assert not np.array_equal(info['pose'][mask], told['pose'][mask])
+    for _ in range(4):  # and they go on as if nothing had been
+        actions = act()
+        assert alike(env.step(actions)[0], other.step(actions)[0], ~mask, ~mask)
+    first, _ = env.reset(seed=3, options={'reset_mask': mask})
+    fresh, _ = other.reset(seed=3)
+    assert alike(first, fresh, mask, mask)  # a seed of the masked alone
+    for wrong in (np.zeros(4, bool), np.ones(3, bool), np.ones(4), [1, 0, 1, 0]):
+        with pytest.raises(UserError, match='reset_mask'):
+            env.reset(options={'reset_mask': wrong})
+    with pytest.raises(UserError, match='without a mask'):
+        make().reset(options={'reset_mask': mask})
 
 
 def test_observations_lie_in_their_space():

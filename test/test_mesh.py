@@ -1,5 +1,6 @@
 """Meshes in and out: the same pictures after a round trip, and one clear error for bad files."""
 
+import dataclasses
 import json
 import math
 import struct
@@ -7,12 +8,16 @@ import struct
 import cv2
 import numpy as np
 import pytest
+import trimesh
+from gltf_files import linear, read_glb
 
 from vn_nav.errors import UserError
 from vn_sim_bridge.houses.labels import LABEL
-from vn_sim_bridge.houses.mesh import export_mesh, load_mesh
+from vn_sim_bridge.houses.mesh import load_mesh
+from vn_sim_bridge.houses.mesh_export import export_mesh
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.render.rasterizer import Rasterizer
+from vn_sim_bridge.scene import uniform_light
 
 FOV = math.radians(90)
 CUBE = """
@@ -55,6 +60,42 @@ def test_a_house_looks_the_same_after_a_round_trip(tmp_path):
     _, other_depth, other_labels, _ = Rasterizer([scene], 64).render(index, cameras, FOV)
     assert (labels == other_labels).mean() > 0.999
     assert (np.abs(depth - other_depth) < 1e-3 * depth).mean() > 0.999
+
+
+def test_a_round_trip_keeps_colours_and_pictures(tmp_path):
+    scene = generate_house(7, rooms=3).scene
+    export_mesh(scene, tmp_path / 'house.glb')
+    again = load_mesh(tmp_path / 'house.glb')
+    faces = len(scene.face_label)
+    light, light_map, lanes = uniform_light(faces)  # baked light is left out
+    plain = dataclasses.replace(scene, face_light=light, face_light_map=light_map, light=lanes)
+    rng = np.random.default_rng(0)
+    low, high = scene.vertices.min(axis=0), scene.vertices.max(axis=0)
+    cameras = np.column_stack([rng.uniform(low[0], high[0], 12), rng.uniform(low[1], high[1], 12),
+                               np.full(12, 1.5), rng.uniform(-3, 3, 12), np.zeros(12)])
+    seen, other = (Rasterizer([s], 64).render(np.zeros(12, int), cameras, FOV)[0].astype(int)
+                   for s in (plain, again))
+    assert seen.std() > 20 and (np.abs(seen - other) <= 1).mean() > 0.995
+    assert {tuple(c) for c in scene.face_colour.round(5).tolist()} == {
+        tuple(c) for c in again.face_colour.round(5).tolist()}
+
+
+def test_an_exported_file_follows_gltf(tmp_path):
+    scene = generate_house(7, rooms=1).scene
+    export_mesh(scene, tmp_path / 'house.glb')
+    document, data = read_glb(tmp_path / 'house.glb')
+    shown = {tuple(c) for c in scene.face_colour.astype(float).tolist()}
+    written = {tuple(m['pbrMetallicRoughness']['baseColorFactor'][:3])
+               for m in document['materials']}
+    assert {tuple(round(linear(v), 4) for v in colour) for colour in shown} == {
+        tuple(round(v, 4) for v in colour) for colour in written}
+    assert document['buffers'] == [{'byteLength': len(data)}]
+    assert all(view['byteOffset'] % 4 == 0 for view in document['bufferViews'])
+    foreign = trimesh.load_scene(tmp_path / 'house.glb', process=False)  # code other than ours
+    assert sum(len(g.faces) for g in foreign.geometry.values()) == scene.triangle_count
+    low, high = foreign.bounds  # y up
+    assert low[[0, 1]] == pytest.approx(scene.vertices.min(axis=0)[[0, 2]], abs=1e-5)
+    assert -high[2] == pytest.approx(scene.vertices.min(axis=0)[1], abs=1e-5)
 
 
 def test_an_obj_has_its_texture_upright_its_label_and_its_scale(tmp_path):

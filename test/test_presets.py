@@ -1,10 +1,13 @@
 """Presets: the numbers of the thesis, what sets its baselines apart, and what is refused."""
 
+import argparse
 import dataclasses
+import re
 
 import pytest
 
 from vn_nav.errors import UserError
+from vn_nav.learning.command import add_train_options, train_config
 from vn_nav.learning.learner import TASKS
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.robot import DRIVE_ACTIONS
@@ -123,3 +126,38 @@ def test_changes_are_kept_and_unknown_names_are_refused():
 def test_bad_trainings_are_refused(change):
     with pytest.raises(UserError, match='correct the training configuration'):
         TrainConfig(**change)
+
+
+def parse(*words):
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--seed', type=int, default=0)
+    add_train_options(parser)
+    return parser.parse_args(['--out', 'nowhere', *words])
+
+
+@pytest.mark.parametrize('text, rule', [
+    ('learning_rate=abc', 'learning_rate is a number'), ('gamma=nan', 'gamma is a number'),
+    ('gamma=true', 'gamma is a number'), ('epochs=2.5', 'epochs is a whole number'),
+    ('frames=1e999', 'frames is a whole number'), ('epochs=', 'epochs is a whole number'),
+    ('track_goal=1', 'track_goal is true or false'), ('clip=wide', 'clip is a number'),
+    ('channels=[1,2]', 'channels is a list; each of its 3 parts is a whole number'),
+    ('channels=7', 'channels is a list'), ('extra_heads=[1]', 'each of its parts is a word'),
+    ('minutes=soon', 'minutes is a number')])
+def test_a_wrong_value_is_blamed_on_the_value(text, rule):
+    args = parse('--set', text)
+    with pytest.raises(UserError, match=re.escape(rule)) as caught:
+        train_config(args)
+    name, _, value = text.partition('=')
+    assert f'correct the value of {name}' in str(caught.value) and 'the name' not in str(
+        caught.value)
+
+
+def test_values_of_every_kind_are_taken():
+    config = train_config(parse(
+        '--set', 'gamma=1', '--set', 'frames=2e6', '--set', 'clip=None', '--set',
+        'channels=[8,16,8]', '--set', 'track_goal=true', '--set', 'teacher=oracle'))
+    assert (config.gamma, config.frames, config.clip, config.channels, config.track_goal,
+            config.teacher) == (1.0, 2_000_000, None, (8, 16, 8), True, 'oracle')
+    assert isinstance(config.gamma, float) and isinstance(config.frames, int)
+    config = train_config(parse('--preset', 'icra2017', '--set', 'frozen_weights=2015'))
+    assert config.frozen_weights == '2015'  # a file's name, whatever it looks like

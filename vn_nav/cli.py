@@ -307,7 +307,7 @@ def run_house_walk(args) -> int:
 
 def run_house_export(args) -> int:
     """`vn_nav house export`."""
-    from vn_sim_bridge.houses.mesh import export_mesh
+    from vn_sim_bridge.houses.mesh_export import export_mesh
     from vn_sim_bridge.houses.procedural import generate_house
     house = generate_house(args.seed, rooms=args.rooms)
     path = args.out or Path(f'house-{args.seed}.glb')

@@ -31,13 +31,15 @@ from vn_nav.evaluation.evaluator import (
 from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.evaluation.report import write_report
 from vn_nav.evaluation.tables import TITLES
+from vn_nav.evaluation.terminal import print_table
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
 
 TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
 UNSEEN_HOUSE = 8  # seed
-SEED = 2026  # of starts and goals
+SEED = 2026  # of starts, goals and light
+BASE = 'config/robots/demo_base.yaml'
 HEARS = 60.0  # s until the recorder has met a node
 STALL = 60.0  # s without a finished episode after which the demo gives up
 LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up|stopped elsewhere) after (\d+) '
@@ -120,8 +122,7 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
     Args:
         out: folder for bag, page and result.json; what an earlier demo left there is replaced.
         folder: of the checkpoint.
-        make_env: (houses, rooms, environments, max_decisions=...) -> vector environment, for the
-            random control.
+        make_env: as `cli_world.make_env`, for the controls without ROS.
         episodes, unseen_episodes: in the trained and in the unseen house.
 
     Returns:
@@ -149,7 +150,7 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
         processes.start('recorder', 'vn_nav.nodes.recorder_node',
                         {'output': str(out / 'bag'), 'topics': RECORDED})
         for index, (place, house, count, limit) in enumerate(places):
-            _drive(console, processes, folder, info, place, house, count, limit,
+            _drive(console, processes, folder, loaded, place, house, count, limit,
                    start_time=1.0 + 1e5 * index)
     except ProcessFailure as error:
         console.print(f'[red]vn_nav demo: {error}[/]; logs are in {out / "logs"}')
@@ -171,23 +172,44 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
     return 0
 
 
-def _drive(console: Console, processes: Processes, checkpoint: Path, info: dict, place: str,
-           house: int, count: int, limit: int, start_time: float) -> None:
+def bridge_parameters(checkpoint: LoadedCheckpoint, house: int, count: int, limit: int) -> dict:
+    """What the sim bridge simulates in one house. `control_env` simulates the same."""
+    info = checkpoint.info
+    return {'house': house, 'rooms': info['rooms'], 'size': checkpoint.config.size,
+            'randomisation': info['randomisation'], 'seed': SEED, 'stop': _stop(info),
+            'robot': str(share_file(BASE)), 'episodes': count, 'max_decisions': limit}
+
+
+def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, house: int, count: int,
+                limit: int):
+    """The same house without ROS: environment k, reset with SEED, begins as episode k over ROS.
+
+    Goal, its picture, start, light and base are equal. Not equal are the numbers behind motion
+    noise, sensor noise, slip and late pictures, which the bridge draws a tick, not a decision,
+    and those behind sampled actions.
+    """
+    same = bridge_parameters(checkpoint, house, count, limit)
+    # The seed of the goal pictures' light is the configuration's, whatever `reset` is given.
+    return make_env([same['house']], same['rooms'], same['episodes'], size=same['size'],
+                    randomisation=same['randomisation'], seed=same['seed'], stop=same['stop'],
+                    robot=Path(same['robot']), max_decisions=same['max_decisions'],
+                    actions=checkpoint.config.actions)
+
+
+def _drive(console: Console, processes: Processes, folder: Path, checkpoint: LoadedCheckpoint,
+           place: str, house: int, count: int, limit: int, start_time: float) -> None:
     """All episodes in one house."""
-    base = str(share_file('config/robots/demo_base.yaml'))
     bridge, policy = f'bridge_{place}', f'policy_{place}'
     note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
     console.print(f'\n[bold]{place} house[/], seed {house}{note}')
     processes.start(policy, 'vn_nav.nodes.policy_node', {
-        'checkpoint': str(checkpoint), 'robot': base, 'time': 'lock_step', 'auto_enable': True,
-        'seed': SEED}, (f'__node:={policy}',))
+        'checkpoint': str(folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
+        'auto_enable': True, 'seed': SEED}, (f'__node:={policy}',))
     # A robot that is where it wants to be at once would be gone before the recorder has met it.
     _wait_until_heard(processes, policy)
-    processes.start(bridge, 'vn_sim_bridge.bridge_node', {
-        'house': house, 'rooms': info['rooms'], 'randomisation': info['randomisation'],
-        'robot': base, 'time': 'lock_step', 'seed': SEED,
-        'episodes': count, 'max_decisions': limit, 'exit_when_done': True,
-        'stop': _stop(info), 'start_time': start_time})
+    processes.start(bridge, 'vn_sim_bridge.bridge_node',
+                    bridge_parameters(checkpoint, house, count, limit) | {
+                        'time': 'lock_step', 'start_time': start_time, 'exit_when_done': True})
     seen, progress = 0, time.monotonic()
     with Live(_progress([], count), console=console, refresh_per_second=8) as live:
         while True:
@@ -246,8 +268,7 @@ def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint,
     stop = _stop(info)
     for (place, house, count, limit), drive in zip(places, drives, strict=True):
         figures = summarise([recorded.episode for recorded in drive.episodes])
-        env = make_env([house], info['rooms'], count, max_decisions=limit, stop=stop,
-                       randomisation=info['randomisation'])
+        env = control_env(make_env, checkpoint, house, count, limit)
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
         actor = PolicyActor(env, checkpoint.network, info['decoding'], SEED,
                             STOP_THRESHOLD if stop == ARRIVAL else info['stop_threshold'])
@@ -260,31 +281,41 @@ def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint,
 
 
 def _paired(recorded: list[RecordedEpisode], in_process: list[Episode]) -> dict:
-    """Success over ROS minus success without it, on the same starts, with a 95 % interval."""
-    differences = [float(one.episode.success) - float(two.success)
-                   for one, two in zip(recorded, in_process, strict=True)]
-    return {'success': sum(differences) / len(differences),
-            'interval': list(bootstrap_interval(differences))}
+    """Success and decisions over ROS minus those without it, on the same starts; 95 %."""
+    found = {}
+    for name in ('success', 'decisions'):
+        differences = [float(getattr(one.episode, name)) - float(getattr(two, name))
+                       for one, two in zip(recorded, in_process, strict=True)]
+        found[name] = sum(differences) / len(differences)
+        found[f'{name}_interval'] = list(bootstrap_interval(differences))
+    return found
 
 
 def _show(console: Console, result: dict, out: Path) -> None:
-    stop = result['trained']['stop']
-    table = Table(title='Measured from the bag of this run'
-                  + (f': {TITLES[stop].lower()}' if stop == DECLARED else ''))
-    headings = ('house', 'policy', 'episodes', 'success', 'SPL', 'decisions', 'collisions',
-                *(('declared', 'false stops') if stop == DECLARED else ()))
-    for heading in headings:
-        table.add_column(heading, justify='left' if heading in ('house', 'policy') else 'right')
     for place in ('trained', 'unseen'):
-        for policy, r in (('vn_nav on ROS 2', result[place]),
-                          ('without ROS', result[place]['without_ros']),
-                          ('random', result[place]['random'])):
-            table.add_row(place, policy, str(r['episodes']), f'{r["success"]:.0%}',
-                          f'{r["spl"]:.2f}', f'{r["decisions"]:.0f}', f'{r["collisions"]:.1%}',
-                          *((f'{r["declared"]:.0%}', f'{r["false_stops"]:.0%}')
-                            if stop == DECLARED else ()))
-    console.print()
-    console.print(table)
-    console.print(f'page    {out / "report.html"}\nbag     {out / "bag"}\n'
-                  f'figures {out / "result.json"}\n{result["seconds"]:.0f} s in all',
+        figures = result[place]
+        stop = f', {TITLES[DECLARED].lower()}' if figures['stop'] == DECLARED else ''
+        console.print()
+        print_table(f'Measured from the bag: {place} house, {figures["episodes"]} episodes{stop}',
+                    *_cells(figures))
+    for name, path in (('page', 'report.html'), ('bag', 'bag'), ('figures', 'result.json')):
+        console.print(f'{name:7} {out / path}', highlight=False, soft_wrap=True)
+    console.print(f'{result["seconds"]:.0f} s in all; in brackets 95 % intervals',
                   highlight=False)
+
+
+def _cells(figures: dict) -> tuple[list[str], list[list[str]]]:
+    """Headings and lines of one house's table."""
+    declared = figures['stop'] == DECLARED
+    headings = ['policy', 'success', 'SPL', 'decisions', 'collisions',
+                *(('declared', 'false\nstops') if declared else ())]
+    lines = []
+    for policy, r in (('over ROS 2', figures), ('without ROS', figures['without_ros']),
+                      ('random', figures['random'])):
+        low, high = r['success_interval']
+        lines.append([
+            policy, f'{r["success"]:.0%} ({100 * low:.0f}-{100 * high:.0f})', f'{r["spl"]:.2f}',
+            '{:.0f} ({:.0f}-{:.0f})'.format(r['decisions'], *r['decisions_interval']),
+            f'{r["collisions"]:.1%}',
+            *((f'{r["declared"]:.0%}', f'{r["false_stops"]:.0%}') if declared else ())])
+    return headings, lines

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import numbers
+from collections.abc import Sequence
 
 import gymnasium
 import numpy as np
@@ -24,7 +26,7 @@ from vn_sim_bridge.houses.house import CELL, interpolate
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.oracle import FloorOracle, turning_table
-from vn_sim_bridge.randomisation import Randomisation
+from vn_sim_bridge.randomisation import Randomisation, load_randomisation
 from vn_sim_bridge.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.world import motion_noise
 
@@ -143,7 +145,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             self._check_backend(backend)
             self.houses = list(backend.houses)
         self._wanders = len(self.houses) > n and not config.one_goal_per_env
-        self._seed = config.seed
+        # Random numbers are functions of an environment's seed and number.
+        self._seeds, self._numbers = np.full(n, config.seed, np.int64), np.arange(n)
         self.task = self._make_task()
         self.backend: Simulator = backend or HouseBackend(
             self.houses, np.arange(n) % len(self.houses), robot=self.robot, size=config.size,
@@ -258,10 +261,11 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             part = slice(first, min(first + BATCH, count))
             view, variant = np.divmod(np.arange(part.start, part.stop), self._variants)
             poses = self.goal_poses[view]
-            appearance = self.backend.appearance(self._seed, Stream.GOAL_APPEARANCE, view, variant)
+            appearance = self.backend.appearance(self.config.seed, Stream.GOAL_APPEARANCE, view,
+                                                 variant)
             frames = self.backend.view(
                 np.array([views[k].house for k in view]), poses, None, appearance,
-                key(self._seed, Stream.GOAL_APPEARANCE, view, variant, 99),
+                key(self.config.seed, Stream.GOAL_APPEARANCE, view, variant, 99),
                 [views[k].objects for k in view])
             self.goals[part], self.goal_segmentation[part] = frames.rgb, frames.labels
             if wanted:
@@ -313,14 +317,20 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if self._explorer is not None:
             more |= {'explorer_seen': self._explorer.seen.copy(),
                      'explorer_found': self._explorer.found.copy()}
-        return {'poses': self.backend.poses.copy(), 'seed': np.array(self._seed), **more,
+        # One seed for all, as a training has it, is kept as one number.
+        alike = (self._seeds == self._seeds[0]).all() and (
+            self._numbers == np.arange(self.num_envs)).all()
+        more |= {} if alike else {'numbers': self._numbers.copy()}
+        seed = self._seeds[0] if alike else self._seeds.copy()
+        return {'poses': self.backend.poses.copy(), 'seed': np.array(seed), **more,
                 **{name.strip('_'): getattr(self, name).copy() for name in self._state},
                 **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
                 **{f'task_{name}': part.copy() for name, part in self.task.state.items()}}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Stand where `get_state` was taken."""
-        self._seed = int(state['seed'])
+        self._seeds[:] = state['seed']
+        self._numbers[:] = state.get('numbers', np.arange(self.num_envs))
         everyone = np.arange(self.num_envs)
         if self._wanders:
             self.backend.enter(everyone, state['house_index'])
@@ -334,17 +344,58 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             part[:] = state[f'objects_{name}']
         for name, part in self.task.state.items():
             part[:] = state[f'task_{name}']
-        self.backend.dress(everyone, self._seed, Stream.APPEARANCE, everyone, self._episode)
+        self.backend.dress(everyone, self._seeds, Stream.APPEARANCE, self._numbers,
+                           self._episode)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start a new episode everywhere; a seed also restarts the count of episodes."""
+    def reset(self, *, seed: int | Sequence[int | None] | None = None,
+              options: dict | None = None):
+        """Start new episodes; a seed also restarts the count of episodes.
+
+        Args:
+            seed: of all environments, which differ by their number; or one for each (None: as it
+                was): environment i then does what environment 0 does with that seed.
+            options: `reset_mask`, [N] bool: which environments begin; the others stay as they are.
+
+        Raises:
+            UserError: another number of seeds, or another mask.
+        """
+        mask = self._reset_mask(options)
         if seed is not None:
-            self._seed = int(seed)
-            self._episode[:] = -1
-        self._begin(np.arange(self.num_envs))
-        self._done[:] = False
+            self._take_seeds(seed, mask)
+        self._begin(np.nonzero(mask)[0])
+        self._done[mask] = False
         none = np.zeros(self.num_envs, bool)
-        return self._result(self._look(), reset=~none, success=none, collided=none)
+        return self._result(self._look(), reset=mask, success=none, collided=none)
+
+    def _reset_mask(self, options: dict | None) -> np.ndarray:
+        """Which environments begin a new episode, [N] bool."""
+        if 'reset_mask' not in (options or {}):
+            return np.ones(self.num_envs, bool)
+        mask = np.asarray(options['reset_mask'])
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise UserError(f'a reset_mask is {self.num_envs} booleans, one of them true',
+                            options['reset_mask'], 'pass such an array')
+        if (self._episode[~mask] < 0).any():
+            raise UserError('every environment has begun before some of them begin again',
+                            'a reset_mask at the first reset', 'reset once without a mask')
+        return mask.copy()
+
+    def _take_seeds(self, seed: int | Sequence[int | None], mask: np.ndarray) -> None:
+        """Give seeds to the environments of the mask [N]."""
+        everyone = np.arange(self.num_envs)
+        if np.ndim(seed) == 0:
+            given, own = [seed] * self.num_envs, everyone
+        else:
+            given, own = list(seed), np.zeros_like(everyone)
+        if len(given) != self.num_envs or not all(
+                one is None or (isinstance(one, numbers.Integral) and 0 <= one < 1 << 63)
+                for one in given):
+            raise UserError(f'a seed is a whole number that is not negative, or {self.num_envs} '
+                            'of them', seed, 'pass such seeds')
+        for n in np.nonzero(mask)[0]:
+            if given[n] is not None:
+                self._seeds[n], self._numbers[n] = given[n], own[n]
+                self._episode[n] = -1
 
     def step(self, actions):
         """One decision in every environment that is not being reset."""
@@ -391,8 +442,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         delta = self._deltas[actions]
         if self.config.noise:
             delta = motion_noise(delta, self._sizes[actions], normal(
-                self._seed, Stream.MOTION_NOISE, acting, self._episode[acting],
-                self._step[acting]))
+                self._seeds[acting], Stream.MOTION_NOISE, self._numbers[acting],
+                self._episode[acting], self._step[acting]))
         motion = self.backend.move(self._as_driven(delta, acting), acting)
         self._path_length[acting] += np.hypot(motion.delta[:, 0], motion.delta[:, 1])
         return motion.collided
@@ -402,8 +453,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         config = self.config.randomisation
         share = self._motion_scale[env_ids]
         if config.slip:
-            counter = (self._seed, Stream.SLIP, env_ids, self._episode[env_ids],
-                       self._step[env_ids])
+            counter = (self._seeds[env_ids], Stream.SLIP, self._numbers[env_ids],
+                       self._episode[env_ids], self._step[env_ids])
             part = key(*counter) % np.uint64(1000) / 1000.0
             share = np.where(uniform(*counter) < config.slip, part, 1.0) * share
         delta = delta.copy()
@@ -415,13 +466,14 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._episode[env_ids] += 1
         if self._wanders:
             own = (len(self.houses) - 1 - env_ids) // self.num_envs + 1  # n, n + N, n + 2 N, ...
-            turn = own * uniform(self._seed, Stream.HOUSE, env_ids, self._episode[env_ids])
+            turn = own * uniform(self._seeds[env_ids], Stream.HOUSE, self._numbers[env_ids],
+                                 self._episode[env_ids])
             self.backend.enter(env_ids, env_ids + turn.astype(np.int64) * self.num_envs)
         for n in env_ids:
-            counter = (self._seed, int(n), int(self._episode[n]))
+            counter = (int(self._seeds[n]), int(self._numbers[n]), int(self._episode[n]))
             episode = self.task.begin(int(n), int(self.house_index[n]), counter, self._tau,
                                       self._mode)
-            variant = tasks.draw_index(self._variants, self._seed, Stream.GOAL_VARIANT,
+            variant = tasks.draw_index(self._variants, counter[0], Stream.GOAL_VARIANT,
                                        *counter[1:])
             self._goal[n], self._goal_yaw[n] = episode.goal, episode.goal_yaw
             self._shown_goal[n] = (self.blank_goal if episode.shown < 0
@@ -434,11 +486,11 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             if episode.field is not None:
                 rows, columns = episode.field.values.shape
                 self._maps[n, :rows, :columns] = episode.field.values
-        self.backend.dress(env_ids, self._seed, Stream.APPEARANCE, env_ids,
-                           self._episode[env_ids])
+        self.backend.dress(env_ids, self._seeds[env_ids], Stream.APPEARANCE,
+                           self._numbers[env_ids], self._episode[env_ids])
         low, high = self.config.randomisation.motion_scale
         self._motion_scale[env_ids] = low + (high - low) * uniform(
-            self._seed, Stream.BASE, env_ids, self._episode[env_ids])
+            self._seeds[env_ids], Stream.BASE, self._numbers[env_ids], self._episode[env_ids])
         self._step[env_ids] = 0
         self._path_length[env_ids] = 0.0
         self._last_action[env_ids] = -1
@@ -470,15 +522,14 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         return tasks.heading_error(self.backend.poses[:, 2], self._goal_yaw)
 
     def _look(self) -> Frames:
-        everyone = np.arange(self.num_envs)
-        return self.backend.observe(keys=key(self._seed, Stream.SENSOR, everyone, self._episode,
-                                             self._step))
+        return self.backend.observe(keys=key(self._seeds, Stream.SENSOR, self._numbers,
+                                             self._episode, self._step))
 
     def _result(self, frames: Frames, reset, success, collided):
         image = frames.rgb.copy()
         if self.config.randomisation.late_picture:
-            late = (uniform(self._seed, Stream.LATE_PICTURE, np.arange(self.num_envs),
-                            self._episode, self._step)
+            late = (uniform(self._seeds, Stream.LATE_PICTURE, self._numbers, self._episode,
+                            self._step)
                     < self.config.randomisation.late_picture) & (self._step > 0)
             image[late] = self._last_image[late]
             self._last_image[:] = image
@@ -583,13 +634,19 @@ class HouseNavigation(gymnasium.Env):
 
     Args:
         house: seed of the house; rooms: its number of rooms.
-        options: further fields of `EnvConfig`.
+        options: further fields of `EnvConfig`; the randomisation may be given by name or file, so
+            that `spec.to_json()` can write it.
     """
 
     metadata = {'render_modes': ['rgb_array'], 'render_fps': 10}
 
     def __init__(self, house: int = 0, rooms: int = 5, render_mode: str | None = None, **options):
         self.render_mode = render_mode
+        # JSON has no tuples.
+        options = {name: tuple(value) if isinstance(value, list) else value
+                   for name, value in options.items()}
+        if isinstance(options.get('randomisation'), str):
+            options['randomisation'] = load_randomisation(options['randomisation'])
         self._batch = NavigationEnv(EnvConfig(houses=(house,), rooms=rooms, num_envs=1, **options))
         size = self._batch.config.size
         picture = spaces.Box(0, 255, (3, size, size), np.uint8)
@@ -619,4 +676,5 @@ class HouseNavigation(gymnasium.Env):
                 'goal': self._batch.goals[observation['goal_index'][0]].copy()}
 
 
-gymnasium.register('vn_nav/House-v0', entry_point=HouseNavigation)
+# By name: a callable cannot be written as JSON.
+gymnasium.register('vn_nav/House-v0', entry_point='vn_sim_bridge.env:HouseNavigation')

@@ -687,8 +687,15 @@ class WarpNavigationEnv:
                             self.config.rooms, 'use more rooms')
         self._rules.mode = MODES[mode]
 
-    def reset(self, *, seed: int | None = None):
-        """Start a new episode everywhere; a seed also restarts the count of episodes."""
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Start a new episode everywhere; a seed also restarts the count of episodes.
+
+        Raises:
+            UserError: a list of seeds, or a `reset_mask`, which `NavigationEnv` knows.
+        """
+        if 'reset_mask' in (options or {}) or not (seed is None or np.ndim(seed) == 0):
+            raise UserError('on a GPU all environments begin together, by one seed',
+                            seed if options is None else options, 'use NavigationEnv')
         if seed is not None:
             self._rules.seed = int(seed)
             self._robots.episode.fill_(-1)

@@ -36,7 +36,8 @@ class RecordedEpisode:
     episode: Episode
     trajectory: np.ndarray  # [K,3] x, y, yaw in the map
     goal_picture: np.ndarray | None  # [H,W,3] uint8
-    pictures: list[np.ndarray]  # camera pictures, [H,W,3] uint8, in order
+    # Number of the decision, from 1: the camera picture [H,W,3] uint8 that it was made on.
+    pictures: dict[int, np.ndarray]
 
 
 @dataclasses.dataclass
@@ -91,11 +92,16 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
         poses[owner_by_stamp(values[6])].append(values[:3])
         posed_at[owner_by_stamp(values[6])].append(record.stamp)
     goal_pictures: list[np.ndarray | None] = [None] * count
-    views = [[] for _ in range(count)]
+    views: list[dict[int, np.ndarray]] = [{} for _ in range(count)]
     for record in records['goal_image']:
         goal_pictures[owner_by_stamp(_seconds(record.message))] = decode_rgb(record.message)
     for record in records['image_raw']:
-        views[owner_by_stamp(_seconds(record.message))].append(decode_rgb(record.message))
+        k = owner_by_stamp(_seconds(record.message))
+        # The first picture since the last judgement; at rest others follow while the policy
+        # thinks.
+        number = bisect.bisect_right(judged_at[k], record.stamp) + 1
+        if number not in views[k]:
+            views[k][number] = decode_rgb(record.message)
     drives = [Drive(scene, []) for _, scene in scenes]
     for k, (stamp, facts) in enumerate(begins):
         place = max(0, bisect.bisect_right([s for s, _ in scenes], stamp + GRACE) - 1)
@@ -110,8 +116,10 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
             episode = dataclasses.replace(
                 episode, declared=ends[k][-1] == 1,
                 reached=_reached(trajectory[last], facts['goal_pose'], drives[place].scene))
+        # After the last episode of all, a robot that stands still goes on to see.
+        seen = {number: view for number, view in views[k].items() if number <= len(rewards[k])}
         drives[place].episodes.append(RecordedEpisode(
-            facts, episode, trajectory, goal_pictures[k], views[k]))
+            facts, episode, trajectory, goal_pictures[k], seen))
     return drives
 
 

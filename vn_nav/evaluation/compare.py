@@ -14,6 +14,7 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation.chart import Series, Shape, legend, panel, to_picture, to_svg
 from vn_nav.evaluation.curves import THRESHOLDS, Run, average, grouped, read_runs, summary
 from vn_nav.evaluation.page import CURVES, page, table
+from vn_nav.evaluation.terminal import print_table
 from vn_nav.policy.checkpoint import write_file
 
 WIDTH, PLOT = 1040, 330  # pixels: of the chart, and the height of its panels
@@ -153,16 +154,5 @@ range. The last column is the mean over the last tenth of the run.</p>
 
 
 def _print(result: dict, out: Path) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    headings, lines = cells(result)
-    terminal = Table(title='Success at tau = 1')
-    for k, heading in enumerate(headings):
-        terminal.add_column(heading, justify='left' if k == 0 else 'right')
-    for line in lines:
-        terminal.add_row(*line)
-    console = Console()
-    if not console.is_terminal:
-        console.width = 160  # a file or a pipe has no width of its own
-    console.print(terminal)
+    print_table('Success at tau = 1', *cells(result))
     print(out)

@@ -22,8 +22,8 @@ moment; a false stop ends the episode. <i>Declared</i> and <i>false stops</i> ar
 episodes; <i>reached</i> is the share in which the robot was at its goal at some time.</dd>
 <dt>SPL</dt><dd>Success weighted by path length: 1 means that every journey succeeded on the
 shortest way.</dd>
-<dt>Length, seconds, return</dt><dd>Means over episodes: decisions; time at the robot's default
-limits; undiscounted reward.</dd>
+<dt>Decisions, seconds, return</dt><dd>Means over episodes; time at the robot's default limits;
+undiscounted reward.</dd>
 <dt>Collisions, contact-free</dt><dd>Share of decisions that touched something; share of episodes
 that succeeded without any.</dd>
 <dt>Stop error</dt><dd>Distance and angle to the goal at the end of all episodes.</dd>

@@ -91,6 +91,7 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'stop_error_m': float(np.mean([e.stop_distance for e in episodes])),
         'stop_error_deg': math.degrees(float(np.mean([e.stop_heading for e in episodes]))),
         'decisions': decisions / len(episodes),
+        'decisions_interval': list(bootstrap_interval([e.decisions for e in episodes])),
         'seconds': float(np.mean([e.seconds for e in episodes])),
         'return': float(np.mean([e.reward for e in episodes])),
         'start_distance': float(np.mean([e.start_distance for e in episodes])),

@@ -67,7 +67,8 @@ def _place(place: str, drive: Drive, figures: dict) -> str:
         (f'{figures["spl"]:.2f}', 'SPL', f'random {control["spl"]:.2f}'),
         (f'{figures["collisions"]:.1%}', 'decisions with a collision',
          f'random {control["collisions"]:.1%}'),
-        (f'{figures["decisions"]:.0f}', 'decisions an episode',
+        (f'{figures["decisions"]:.0f}',
+         'decisions an episode ({:.0f} to {:.0f})'.format(*figures['decisions_interval']),
          f'at most {figures["max_decisions"]}; random {control["decisions"]:.0f}'),
         *stops,
     ])
@@ -118,13 +119,12 @@ def _chosen(episodes: list[RecordedEpisode], most: int = 4) -> list[RecordedEpis
 
 def _journey(recorded: RecordedEpisode) -> str:
     e = recorded.episode
-    # Pictures taken while the robot stood still repeat themselves.
-    views = [view for before, view in zip([None, *recorded.pictures], recorded.pictures,
-                                          strict=False)
-             if before is None or not np.array_equal(before, view)]
-    picked = np.unique(np.linspace(0, len(views) - 1, STRIP).round().astype(int))
-    frames = ''.join(f'<figure><img alt="" src="{picture(views[i])}">'
-                     f'<figcaption>{i}</figcaption></figure>' for i in picked)
+    numbers = sorted(recorded.pictures)
+    picked = np.unique(np.linspace(0, len(numbers) - 1, STRIP).round().astype(int))
+    frames = ''.join(
+        f'<figure><img alt="" src="{picture(recorded.pictures[number])}">'
+        f'<figcaption>{"decision " if k == 0 else ""}{number}</figcaption></figure>'
+        for k, number in enumerate(numbers[i] for i in picked))
     kind, words = _outcome(e)
     return f"""<div class="journey"><h3>To the {html.escape(e.goal)}:
 <span class="{kind}">{words}</span> <small>after {e.decisions} decisions, {e.path_length:.1f} m

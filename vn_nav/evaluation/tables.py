@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from vn_nav.evaluation.evaluator import DECLARED
 from vn_nav.evaluation.page import table
+from vn_nav.evaluation.terminal import print_table
 
 TITLES = {'arrival': 'Arrival', 'declared': 'Declared stop'}
 SPLITS = {  # names of splits, for people
@@ -20,7 +21,8 @@ COLUMNS: tuple[Column, ...] = (
     ('success (95 %)', lambda r: '{:.2f} ({:.2f}-{:.2f})'.format(r['success'],
                                                                  *r['success_interval'])),
     ('SPL', lambda r: f'{r["spl"]:.2f}'),
-    ('length', lambda r: f'{r["decisions"]:.0f}'),
+    ('decisions (95 %)', lambda r: '{:.0f} ({:.0f}-{:.0f})'.format(r['decisions'],
+                                                                   *r['decisions_interval'])),
     ('seconds', lambda r: f'{r["seconds"]:.0f}'),
     ('collisions', lambda r: f'{r["collisions"]:.1%}'),
     ('contact-free', lambda r: f'{r["contact_free_success"]:.2f}'),
@@ -90,18 +92,9 @@ def print_scenes(scenes: dict, title: str) -> None:
 
 
 def _print(title: str, headings: list[str], lines: list[list[str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    terminal = Table(title=title)
-    for k, heading in enumerate(headings):
-        words = heading if k == 0 else heading.replace(' ', '\n', 1).replace('-', '-\n')
-        terminal.add_column(words, justify='left' if k == 0 else 'right', no_wrap=True)
-    for line in lines:
-        terminal.add_row(*line)
-    console = Console()
-    if not console.is_terminal:
-        console.width = 200  # a file or a pipe has no width of its own
-    console.print(terminal)
+    first, *others = headings
+    print_table(title, [first, *(heading.replace(' ', '\n', 1).replace('-', '-\n')
+                                 for heading in others)], lines)
 
 
 def rows_html(rows: dict[str, dict], stop: str) -> str:

@@ -184,12 +184,8 @@ def train_config(args: argparse.Namespace) -> TrainConfig:
             changes[name] = ast.literal_eval({'true': 'True', 'false': 'False'}.get(value, value))
         except (ValueError, SyntaxError):
             changes[name] = value
-        if isinstance(known[name], bool) and not isinstance(changes[name], bool):
-            raise UserError(f'{name} is true or false', value, 'write one of the two')
-    if 'frames' in changes:
-        changes['frames'] = int(changes['frames'])
-    if 'channels' in changes:
-        changes['channels'] = tuple(changes['channels'])
+        if isinstance(known[name], str):
+            changes[name] = value  # a word, whatever it looks like
     return preset(args.preset, **changes, seed=args.seed, tensorboard=not args.no_tensorboard)
 
 

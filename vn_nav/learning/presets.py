@@ -17,13 +17,29 @@ starts from it; every number can be changed from the command line.
 from __future__ import annotations
 
 import dataclasses
+import math
+import numbers
 import re
+import typing
 
 from vn_nav.errors import UserError
 from vn_nav.learning.learner import LearnerConfig
 from vn_nav.policy.encoders import LARGE
 from vn_nav.policy.network import NetworkConfig
 
+
+def _is_finite(value) -> bool:
+    return (isinstance(value, numbers.Real) and not isinstance(value, bool)
+            and math.isfinite(value))
+
+
+# What a field may be: words for people, and the test.
+KINDS: dict[type, tuple] = {
+    bool: ('true or false', lambda value: isinstance(value, bool)),
+    int: ('a whole number', lambda value: _is_finite(value) and value == int(value)),
+    float: ('a number', _is_finite),
+    str: ('a word', lambda value: isinstance(value, str)),
+}
 BAG_WEIGHTS = ('bag_imitation', 'bag_goal_pose', 'bag_arrival', 'bag_distance', 'bag_image')
 
 
@@ -190,13 +206,40 @@ def preset(name: str, **changes) -> TrainConfig:
     """The configuration of a preset with some numbers changed.
 
     Raises:
-        UserError: an unknown preset or number.
+        UserError: an unknown preset or number, or a value of another kind.
     """
     if name not in PRESETS:
         raise UserError(f'a preset is one of {", ".join(PRESETS)}', name, 'choose one')
-    try:
-        return TrainConfig(**{**PRESETS[name], 'preset': name, **changes})
-    except TypeError as error:
-        known = ', '.join(field.name for field in dataclasses.fields(TrainConfig))
-        raise UserError(f'a training has only the numbers {known}', str(error),
-                        'correct the name') from error
+    known = typing.get_type_hints(TrainConfig)
+    for key in changes:
+        if key not in known:
+            raise UserError(f'a training has only the numbers {", ".join(known)}', key,
+                            'correct the name')
+    changes = {key: _value(key, value, known[key]) for key, value in changes.items()}
+    return TrainConfig(**{**PRESETS[name], 'preset': name, **changes})
+
+
+def _value(name: str, value, kind):
+    """A value as its field wants it.
+
+    Raises:
+        UserError: a value of another kind.
+    """
+    options = typing.get_args(kind)
+    if type(None) in options:
+        if value is None:
+            return None
+        (kind,) = (option for option in options if option is not type(None))
+    if kind in KINDS:
+        words, fits = KINDS[kind]
+        if fits(value):
+            return kind(value)
+    else:  # a tuple of so many, or of any number
+        parts = typing.get_args(kind)
+        many = parts[-1] is ...
+        words, fits = KINDS[parts[0]]
+        words = f'a list; each of its {"" if many else f"{len(parts)} "}parts is {words}'
+        if isinstance(value, (tuple, list)) and (many or len(value) == len(parts)) and all(
+                map(fits, value)):
+            return tuple(value)
+    raise UserError(f'{name} is {words}', repr(value), f'correct the value of {name}')

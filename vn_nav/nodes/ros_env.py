@@ -164,7 +164,14 @@ class RosEnv:
         """Do nothing: where a robot starts is not for its policy's trainer to say."""
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Begin episodes where the robots stand."""
+        """Begin episodes where the robots stand; a seed has no meaning there.
+
+        Raises:
+            UserError: a `reset_mask`: robots begin together.
+        """
+        if 'reset_mask' in (options or {}):
+            raise UserError('robots over ROS begin their episodes together', 'a reset_mask',
+                            'reset without it')
         seen = [self._begin(n) for n in range(self.num_envs)]
         none = np.zeros(self.num_envs, bool)
         self._done[:] = False
