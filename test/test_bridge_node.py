@@ -508,13 +508,16 @@ def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
                output=tmp_path / 'bag') as recorder, \
          child(BRIDGE, tmp_path / 'bridge.log', house=7, time='lock_step',
                robot=DEMO_BASE, noise=False, seed=5, episodes=sequences, max_decisions=length,
-               exit_when_done=True) as bridge, \
-         child('vn_nav.nodes.policy_node', tmp_path / 'policy.log', checkpoint=checkpoint,
-               time='lock_step', robot=DEMO_BASE, auto_enable=True, seed=5) as policy:
-        bridge.wait(100)
-        for process in (policy, recorder):
-            process.send_signal(signal.SIGINT)
-            assert process.wait(20) == 0
+               exit_when_done=True) as bridge:
+        # The true pose has no history: nobody drives before the recorder has met the bridge.
+        wait_until(lambda: 'sim_bridge_node' in (tmp_path / 'recorder.log').read_text(),
+                   lambda: time.sleep(0.1))
+        with child('vn_nav.nodes.policy_node', tmp_path / 'policy.log', checkpoint=checkpoint,
+                   time='lock_step', robot=DEMO_BASE, auto_enable=True, seed=5) as policy:
+            bridge.wait(100)
+            for process in (policy, recorder):
+                process.send_signal(signal.SIGINT)
+                assert process.wait(20) == 0
     drive = drives_from_bag(tmp_path / 'bag')[0]
     actions = [(record.stamp, record.message.data)
                for record in read_bag(tmp_path / 'bag', ('action',))]
