@@ -27,7 +27,7 @@ from small_bags import (
 
 from vn_nav import cli
 from vn_nav.bags.doctor import ERROR, WARNING, diagnose
-from vn_nav.bags.drive import Topics
+from vn_nav.bags.roles import Topics
 
 FAR = 60_000_000_000  # ns
 

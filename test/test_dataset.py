@@ -12,8 +12,9 @@ import pytest
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags import dataset
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import MISFIT, Topics
+from vn_nav.bags.drive import MISFIT
 from vn_nav.bags.reader import read_bag
+from vn_nav.bags.roles import Topics
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess, preprocess_map
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -80,7 +81,7 @@ def test_every_picture_can_be_had_too(tmp_path, drives):
 
 
 def test_a_bag_that_cannot_be_learned_from_is_refused(tmp_path):
-    with pytest.raises(UserError, match='folder with MCAP files'):
+    with pytest.raises(UserError, match='no such file or folder'):
         load_drives(tmp_path / 'nowhere', WANTED, tmp_path)
     with pytest.raises(UserError, match='--topics'):
         load_drives(BAG, dataclasses.replace(WANTED, topics=Topics(image='camera')), tmp_path)

@@ -12,17 +12,24 @@ from vn_nav.bags.drive import (
     Cutter,
     Heard,
     Report,
-    Topics,
     integrate,
-    load_topics,
     synchronise,
 )
+from vn_nav.bags.roles import TYPES, Topics, load_topics
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
-TOPICS = Topics().within(['/image_raw', '/odom', '/cmd_vel', '/goal_image', '/depth/image_raw',
-                          '/episode_end'])
+ROLES = {'/image_raw': 'image', '/odom': 'odometry', '/cmd_vel': 'command',
+         '/goal_image': 'goal', '/depth/image_raw': 'depth', '/episode_end': 'episode_end'}
+
+
+def typed(**roles):
+    """Topics by role, with a type that each may have."""
+    return {name: TYPES[role][0] for role, name in roles.items()}
+
+
+TOPICS = Topics().within({name: TYPES[role][0] for name, role in ROLES.items()})
 
 
 def header(stamp):
@@ -150,7 +157,7 @@ def test_episodes_end_where_they_are_said_to_where_the_goal_changes_and_at_gaps_
 
 
 def test_velocities_stand_in_for_odometry_and_are_not_believed_for_ever():
-    topics = Topics().within(['/image_raw', '/cmd_vel'])
+    topics = Topics().within(typed(image='/image_raw', command='/cmd_vel'))
     assert topics.odometry == ''
     messages = [Heard('/cmd_vel', twist(0.4, 0.0), t) for t in np.arange(1.0, 2.0, 0.1)]
     messages += [Heard('/cmd_vel', twist(math.nan, 0.0), 1.55)]
@@ -196,15 +203,17 @@ def test_a_robot_that_stands_still_gives_one_frame_an_episode():
 
 
 def test_topics_are_found_by_role_and_renamed_by_a_file(tmp_path):
-    assert Topics().within(['image_raw/compressed', 'odom']).image == 'image_raw/compressed'
+    names = typed(image='image_raw/compressed', odometry='odom')
+    assert Topics().within(names).image == 'image_raw/compressed'
     path = tmp_path / 'topics.yaml'
     path.write_text('image: /camera/color/image_raw\nodometry: /base/odom\n')
-    found = load_topics(path).within(['/camera/color/image_raw/compressed', '/base/odom'])
+    found = load_topics(path).within(typed(image='/camera/color/image_raw/compressed',
+                                           odometry='/base/odom'))
     assert found.image == '/camera/color/image_raw/compressed' and found.odometry == '/base/odom'
     with pytest.raises(UserError, match='image_raw'):
-        Topics().within(['/odom'])
+        Topics().within(typed(odometry='/odom'))
     with pytest.raises(UserError, match='odometry or command'):
-        Topics().within(['/image_raw'])
+        Topics().within(typed(image='/image_raw'))
     for text in ('picture: /a', 'image: 3', '- a', ': :', 'image: "/"'):
         path.write_text(text)
         with pytest.raises(UserError, match='topics'):

@@ -18,7 +18,7 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.dataset import MAX_DEPTH, DriveSet
-from vn_nav.bags.drive import GAP, JUMP
+from vn_nav.bags.drive import JUMP
 from vn_nav.bags.pose_graph import (
     GATE,
     Edges,
@@ -30,6 +30,7 @@ from vn_nav.bags.pose_graph import (
     relative,
     solve,
 )
+from vn_nav.bags.stamped import GAP
 from vn_nav.bags.two_view import Camera
 from vn_nav.robot import RobotSpec
 
@@ -105,7 +106,7 @@ class _Drive:
         steps = between(self.odometry[:-1], self.odometry[1:])
         ways = np.hypot(steps[:, 0], steps[:, 1])
         carried = (np.diff(drives.episode) != 0) & (
-            (np.diff(drives.time) > GAP) | (ways > JUMP))
+            (np.abs(np.diff(drives.time)) > GAP) | (ways > JUMP))
         self.way, self.turn, self.net = (  # m driven, rad turned, rad to the left, [N]
             np.append(0.0, np.cumsum(np.where(carried, 0.0, moved)))
             for moved in (ways, np.abs(steps[:, 2]), steps[:, 2]))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import RECORDED, Topics, load_topics
-from vn_nav.bags.loops import straighten
+from vn_nav.bags.drive import RECORDED
+from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.bags.stream import messages
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
@@ -68,7 +68,11 @@ def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec
     facts = drives.facts
     print(f'{args.bag}: {len(drives):,} pictures with poses in {facts["episodes"]:,} '
           f'stretch{"es" * (facts["episodes"] > 1)}; {facts["without_pose"]:,} without a pose, '
-          f'{facts["jumps"]:,} jumps', flush=True)
+          f'{facts["jumps"]:,} jumps' + (f', {facts["set_back"]:,} times the clock of the '
+                                         'pictures was set back' if facts['set_back'] else ''),
+          flush=True)
+    for note in facts['notes']:
+        print(f'{args.bag}: {note}', flush=True)
     margin = {} if args.margin is None else {'margin': args.margin}
     poses = _straightened(args.bag, drives, robot, topics, cache) if args.straighten else (
         drives.pose)
@@ -84,6 +88,7 @@ def _straightened(bag: Path, drives: DriveSet, robot: RobotSpec, topics: Topics,
 
     Larger pictures than the network's tell more exactly.
     """
+    from vn_nav.bags.loops import straighten
     large = drives
     if drives.image.shape[-1] < LOOKED_AT:
         large = load_drives(bag, Wanted(robot, LOOKED_AT, topics, every=True), cache)

@@ -9,7 +9,6 @@ import ctypes
 import dataclasses
 import hashlib
 import json
-import math
 import os
 import shutil
 from pathlib import Path
@@ -19,34 +18,16 @@ import safetensors.torch
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.files import sync_folder, write_file
+from vn_nav.policy.checkpoint_info import (
+    CARD,
+    CONFIG,
+    FORMAT,
+    WEIGHTS,
+    check_info,
+    read_config,
+)
 from vn_nav.policy.network import NetworkConfig, Policy
-
-WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
-FORMAT = 2
-DECODINGS = ('sample', 'greedy')
-REQUIRED = object()
-# What a checkpoint says beside its weights, and what it says when nobody told it.
-INFO = {
-    'world_version': REQUIRED,  # of the simulator's pixels, houses and motion
-    'camera_fov_deg': REQUIRED,  # of the square picture
-    'camera_height': REQUIRED,  # m above the floor
-    'decoding': 'sample',  # the rule that `results` were measured with
-    'houses': [],  # seeds
-    'rooms': None,  # of each house
-    'task': 'image',  # what it was trained for
-    'objects': 1,  # in the house at a time
-    'randomisation': 'none',  # of light, camera and base: a name, or a file's path
-    'preset': '',  # see vn_nav.learning.presets
-    'goals_per_room': 1,  # of each house
-    'goal_variants': None,  # differently lit pictures of each goal; None: the randomisation's
-    'stop_threshold': None,  # probability of arrival above which the policy declares its stop
-    'seed': None,
-    'frames': 0,  # agent decisions
-    'minutes': 0.0,  # wall-clock of training
-    'command': '',  # that trained it
-    'results': {},  # measured figures and controls, by name
-    'notes': '',
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +54,7 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
             that is not finite, or a full disk; the checkpoint before is whole.
     """
     folder = Path(folder)
-    info = _check_info(info, 'the checkpoint to save')
+    info = check_info(info, 'the checkpoint to save')
     tensors = {}
     for name, tensor in network.state_dict().items():
         stored = tensor.detach().to(torch.float16 if half else torch.float32)
@@ -119,27 +100,8 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
             actions.
     """
     folder = Path(folder)
-    for name in (CONFIG, WEIGHTS):
-        if not (folder / name).is_file():
-            raise UserError(f'a checkpoint is a folder with {CONFIG} and {WEIGHTS}',
-                            str(folder / name), 'pass such a folder; shipped ones are in models/')
-    try:
-        config = json.loads((folder / CONFIG).read_text())
-    except ValueError as error:
-        raise UserError(f'{CONFIG} is JSON', f'{folder / CONFIG}: {error}',
-                        'get the checkpoint again') from error
-    if not isinstance(config, dict) or config.get('format') != FORMAT:
-        received = config.get('format') if isinstance(config, dict) else type(config).__name__
-        raise UserError(f'{CONFIG} has format {FORMAT}', received,
-                        'use the version of vn_nav that wrote it, or train again')
+    config, info = read_config(folder)
     where = str(folder / CONFIG)
-    own = {'format', 'network', 'action_names', 'sha256'}
-    missing = own - config.keys()
-    if missing:
-        raise UserError(f'{CONFIG} has the keys {", ".join(sorted(own))}',
-                        f'{where} without {", ".join(sorted(missing))}',
-                        'get the checkpoint again')
-    info = _check_info({key: value for key, value in config.items() if key not in own}, where)
     weights = (folder / WEIGHTS).read_bytes()
     digest = hashlib.sha256(weights).hexdigest()
     if digest != config['sha256']:
@@ -178,25 +140,6 @@ def _load_weights(network: Policy, weights: bytes, where: str) -> None:
             raise UserError('weights are finite numbers of 16 or 32 bits', f'{name} in {where}',
                             'get the checkpoint again')
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-
-
-def _check_info(info: dict, where: str) -> dict:
-    unknown = sorted(info.keys() - INFO.keys())
-    if unknown:
-        raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} beside the network',
-                        f'{unknown[0]} in {where}', 'remove it, or use the version of vn_nav '
-                        'that wrote it')
-    full = {key: info.get(key, default) for key, default in INFO.items()}
-    missing = [key for key, value in full.items() if value is REQUIRED]
-    if missing:
-        raise UserError(f'{CONFIG} has the key {missing[0]}', f'{where} without it', 'add it')
-    if full['decoding'] not in DECODINGS:
-        raise UserError('decoding is sample or greedy', full['decoding'], f'correct {where}')
-    for key, limit in (('camera_fov_deg', 179.0), ('camera_height', 100.0)):
-        value = full[key]
-        if not (isinstance(value, (int, float)) and math.isfinite(value) and 0 < value <= limit):
-            raise UserError(f'{key} lies in (0, {limit:g}]', value, f'correct {where}')
-    return full
 
 
 def model_card(config: dict, parameters: int, size: int) -> str:
@@ -281,20 +224,6 @@ def _figure(value: object) -> str:
     return str(value)
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file that appears, or is replaced, whole or not at all, and survives a crash."""
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
-    try:
-        with open(temporary, 'wb') as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    _sync_folder(path.parent)
-
-
 def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
     """Write a folder that appears, or is replaced, whole or not at all."""
     folder = folder.absolute()
@@ -315,7 +244,7 @@ def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
             temporary.rename(folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    _sync_folder(folder.parent)
+    sync_folder(folder.parent)
 
 
 def _exchange(one: Path, other: Path) -> None:
@@ -331,11 +260,3 @@ def _exchange(one: Path, other: Path) -> None:
         other.rename(aside)
         one.rename(other)
         aside.rename(one)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
