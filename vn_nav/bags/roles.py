@@ -57,16 +57,16 @@ class Topics:
             if role in ('image', 'goal') and name not in there:
                 name = f'{name}/compressed'
             found[role] = there.get(name, '')
-            kind = recorded.get(found[role], '')
-            if found[role] and not fits(role, kind):
-                others = set(recorded) - {found[role]}
-                raise UserError(fault(role), f'{found[role]}: {kind or "no type"}',
-                                remedy(role, {name: recorded[name] for name in others}))
+        free = {name: kind for name, kind in recorded.items() if name not in found.values()}
+        for role, name in found.items():
+            if name and not fits(role, recorded[name]):
+                raise UserError(fault(role), f'{name}: {recorded[name] or "no type"}',
+                                remedy(role, free))
         if not found['image'] or not (found['odometry'] or found['command']):
             role = 'image' if not found['image'] else 'odometry or command'
             first = role.split()[0]
             raise UserError(f'a bag to learn from holds the topic {getattr(self, first)} ({role})',
-                            sorted(there), remedy(first, recorded))
+                            sorted(there), remedy(first, free))
         return Topics(**found)
 
 
@@ -120,9 +120,10 @@ def proposal(role: str, recorded: Mapping[str, str]) -> str:
 
 def remedy(role: str, recorded: Mapping[str, str]) -> str:
     """What to do where a role has no topic, or one of another type; see `proposal`."""
-    if proposed := proposal(role, recorded):
-        return proposed
+    proposed = proposal(role, recorded)
     if role in ('image', 'odometry', 'command'):
-        return (f'name the topic of the bag in a YAML file ({role}: /its/name) and give it with '
-                '--topics, or record it')
-    return f'write `{role}: null` into a YAML file and give it with --topics to leave it out'
+        return proposed or (f'name the topic of the bag in a YAML file ({role}: /its/name) and '
+                            'give it with --topics, or record it')
+    leave = f'`{role}: null` to leave it out'
+    return f'{proposed}, or {leave}' if proposed else (
+        f'write {leave} into a YAML file and give it with --topics')
