@@ -1,31 +1,41 @@
 """Starts the policy on a robot: `ros2 launch vn_nav drive.launch.py`.
 
 The robot's own drivers publish the pictures and read the velocity commands (README, "Topics").
-Topics are relative: a namespace moves them all, and remappings meet other names.
+Topics are relative: a namespace moves them all, and remappings meet other names. The launch ends
+when the node ends: with exit code 1 when it died.
 """
+
+import os
+import signal
 
 from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
-    EmitEvent,
+    OpaqueFunction,
     RegisterEventHandler,
     SetEnvironmentVariable,
+    Shutdown,
+    TimerAction,
 )
-from launch.conditions import IfCondition
-from launch.events import matches_action
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import LifecycleNode
-from launch_ros.event_handlers import OnStateTransition
-from launch_ros.events.lifecycle import ChangeState
+from launch.event_handlers import OnProcessExit
+from launch.substitutions import (
+    EnvironmentVariable,
+    LaunchConfiguration,
+    PathJoinSubstitution,
+)
+from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
-from lifecycle_msgs.msg import Transition
+
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+BAD_INPUT = 2  # exit code: starting again would not help
+RESPAWN_DELAY = 2.0  # s
 
 
 def generate_launch_description():
-    """Describe the arguments, the environment, the node and its way to the active state."""
+    """Describe the arguments, the environment and the node."""
     config = PathJoinSubstitution([FindPackageShare('vn_nav'), 'config'])
-    arguments = [
+    return LaunchDescription([
         DeclareLaunchArgument(
             'namespace', default_value='', description='Namespace of the node and its topics'),
         DeclareLaunchArgument(
@@ -42,50 +52,50 @@ def generate_launch_description():
             description='Start the node again when it dies; it then comes up unconfigured'),
         DeclareLaunchArgument(
             'log_level', default_value='info', description='debug, info, warn, error or fatal'),
-        DeclareLaunchArgument(
-            'fastdds_profile',
-            default_value=PathJoinSubstitution([config, 'fastdds_multihost.xml']),
-            description='Fast DDS profile; the camera driver needs it too, or frames are lost'),
-    ]
-    policy = LifecycleNode(
+        # The camera driver needs a profile like this one too, or frames are lost. A user's own
+        # profile, and that of sim.launch.py, stay.
+        SetEnvironmentVariable(PROFILE, EnvironmentVariable(
+            PROFILE, default_value=PathJoinSubstitution([config, 'fastdds_multihost.xml']))),
+        OpaqueFunction(function=_start),
+    ])
+
+
+def _start(context):
+    """Start the node; without its parameters it would be another one."""
+    path = LaunchConfiguration('params_file').perform(context)
+    if not os.path.isfile(path):
+        raise RuntimeError(f'params_file is a file that exists; received {path!r}; correct it')
+    # The node configures and activates itself, once: what an operator does later with
+    # `ros2 lifecycle set` is not followed by anything behind his back.
+    return _policy(ParameterValue(LaunchConfiguration('autostart'), value_type=bool))
+
+
+def _policy(autostart):
+    """Return the node, and what follows its end."""
+    policy = Node(
         package='vn_nav',
         executable='policy_node',
         name='policy_node',
         namespace=LaunchConfiguration('namespace'),
         parameters=[
             LaunchConfiguration('params_file'),
-            # The events below bring the node up; its own autostart would do it a second time.
             {'use_sim_time': ParameterValue(
-                LaunchConfiguration('use_sim_time'), value_type=bool), 'autostart': False},
+                LaunchConfiguration('use_sim_time'), value_type=bool), 'autostart': autostart},
         ],
         arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
-        respawn=LaunchConfiguration('use_respawn'),
-        respawn_delay=2.0,
         output='screen',
     )
-    # Registered before the node starts, so that no transition is missed. A node that respawns is
-    # not configured again: after a crash somebody looks before the robot moves.
-    autostart = IfCondition(LaunchConfiguration('autostart'))
-    activate_when_configured = RegisterEventHandler(
-        OnStateTransition(
-            target_lifecycle_node=policy,
-            start_state='configuring',
-            goal_state='inactive',
-            entities=[_request(policy, Transition.TRANSITION_ACTIVATE)],
-        ),
-        condition=autostart,
-    )
-    return LaunchDescription([
-        *arguments,
-        SetEnvironmentVariable(
-            'FASTRTPS_DEFAULT_PROFILES_FILE', LaunchConfiguration('fastdds_profile')),
-        activate_when_configured,
-        policy,
-        _request(policy, Transition.TRANSITION_CONFIGURE, condition=autostart),
-    ])
+    return [RegisterEventHandler(OnProcessExit(target_action=policy, on_exit=_on_exit)), policy]
 
 
-def _request(node, transition, **options):
-    return EmitEvent(
-        event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=transition),
-        **options)
+def _on_exit(event, context):
+    """End the launch with the node, or start it again."""
+    if context.is_shutdown:
+        return []
+    if event.returncode in (0, -signal.SIGINT):
+        return [Shutdown(reason='policy_node has ended')]
+    if event.returncode != BAD_INPUT and (
+            LaunchConfiguration('use_respawn').perform(context) == 'true'):
+        # Unconfigured: after a crash somebody looks before the robot moves.
+        return [TimerAction(period=RESPAWN_DELAY, actions=_policy(False))]
+    raise RuntimeError(f'policy_node died with exit code {event.returncode}; see its output above')

@@ -1,19 +1,26 @@
 """Starts the simulated robot and the policy: `ros2 launch vn_nav sim.launch.py`.
 
 Everything stays on this host: the Fast DDS profile knows shared memory and the loopback interface.
+The launch ends when one of the two ends: with exit code 1 when it died.
 """
+
+import signal
 
 from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
     IncludeLaunchDescription,
+    RegisterEventHandler,
     SetEnvironmentVariable,
+    Shutdown,
 )
+from launch.event_handlers import OnProcessExit
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+BAD_INPUT = 2  # exit code: starting again would not help
 PASSED_ON = ('namespace', 'use_sim_time', 'params_file', 'autostart', 'use_respawn', 'log_level')
 
 
@@ -35,7 +42,7 @@ def generate_launch_description():
             description='Configure and activate the policy; driving still waits for ~/enable'),
         DeclareLaunchArgument(
             'use_respawn', default_value='false', choices=['true', 'false'],
-            description='Start a node again when it dies'),
+            description='Start a node again when it dies; the policy then comes up unconfigured'),
         DeclareLaunchArgument(
             'log_level', default_value='info', description='debug, info, warn, error or fatal'),
     ]
@@ -53,16 +60,27 @@ def generate_launch_description():
     )
     policy = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(PathJoinSubstitution([share, 'launch', 'drive.launch.py'])),
-        launch_arguments={
-            **{name: LaunchConfiguration(name) for name in PASSED_ON},
-            'fastdds_profile': profile,
-        }.items(),
+        launch_arguments={name: LaunchConfiguration(name) for name in PASSED_ON}.items(),
     )
     return LaunchDescription([
         *arguments,
         SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile),
         # ROS adds no peers and no interfaces of its own to those of the profile.
         SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SYSTEM_DEFAULT'),
+        policy,  # first: it checks the params file
+        RegisterEventHandler(OnProcessExit(target_action=bridge, on_exit=_on_exit)),
         bridge,
-        policy,
     ])
+
+
+def _on_exit(event, context):
+    """End the launch with the bridge, unless it is started again."""
+    if context.is_shutdown:
+        return []
+    if event.returncode in (0, -signal.SIGINT):
+        return [Shutdown(reason='sim_bridge_node has ended')]
+    if event.returncode != BAD_INPUT and (
+            LaunchConfiguration('use_respawn').perform(context) == 'true'):
+        return []  # the action does it
+    raise RuntimeError(
+        f'sim_bridge_node died with exit code {event.returncode}; see its output above')

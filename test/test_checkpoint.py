@@ -12,6 +12,7 @@ from vn_nav.errors import UserError
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import HEADS, NetworkConfig, Policy
 from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime
+from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS
 
 SMALL = NetworkConfig(actions=DRIVE_ACTIONS, size=36, channels=(8, 8, 8), features=24, hidden=16)
@@ -67,9 +68,104 @@ def test_damage_is_refused(tmp_path):
     weights.write_bytes(sound)
     config = json.loads((folder / 'config.json').read_text())
     config['network']['hidden'] = 99
+    del config['config_sha256']  # as in checkpoints from before it
     (folder / 'config.json').write_text(json.dumps(config))
     with pytest.raises(UserError, match='fits'):
         load_checkpoint(folder)
+
+
+def test_a_flipped_bit_in_the_configuration_is_refused(tmp_path):
+    folder = tmp_path / 'model'
+    save_checkpoint(folder, Policy(SMALL), {**FACTS, 'results': {'a': {3: 0.5, 20: 1}}})
+    path = folder / 'config.json'
+    sound = path.read_bytes()
+    meant = json.loads(sound)
+    assert load_checkpoint(folder).config == SMALL
+    at = sound.index(b'"pixel_std": 36') + len(b'"pixel_std": 3')  # 36.0 becomes 37.0
+    for place in (at, *np.random.default_rng(0).integers(0, len(sound), 200)):
+        flipped = bytearray(sound)
+        flipped[place] ^= 1
+        path.write_bytes(flipped)
+        try:
+            same = json.loads(flipped) == meant  # layout alone
+        except ValueError:
+            same = False
+        if same:
+            load_checkpoint(folder)
+        else:
+            with pytest.raises(UserError):
+                load_checkpoint(folder)
+
+
+@pytest.mark.slow
+def test_the_shipped_models_and_those_from_before_the_checksum_load(tmp_path):
+    for name in ('house', 'anywhere'):
+        source = share_file(f'models/{name}')
+        config = json.loads((source / 'config.json').read_text())
+        assert config.pop('config_sha256')
+        old = tmp_path / name
+        old.mkdir()
+        (old / 'config.json').write_text(json.dumps(config))
+        (old / 'model.safetensors').symlink_to(source / 'model.safetensors')
+        new, before = load_checkpoint(source), load_checkpoint(old)
+        assert new.info == before.info and new.config == before.config
+
+
+@pytest.mark.parametrize('change, word', [
+    (lambda c: c['network'].update(hidden='16'), 'hidden'),
+    (lambda c: c['network'].update(hidden=10**9), 'hidden'),
+    (lambda c: c['network'].update(features=65_000, hidden=65_000), 'fits'),
+    (lambda c: c['network'].update(pixel_std=True), 'pixel_std'),
+    (lambda c: c['network'].update(heads=5), 'heads'),
+    (lambda c: c['network'].update(channels=['a', 'b', 'c']), 'can be built'),
+    (lambda c: c['network'].update(layers=3), 'only the fields'),
+    (lambda c: c.update(network=[]), 'mapping'),
+    (lambda c: c.update(action_names=[1, 2]), 'action_names'),
+    (lambda c: c.update(action_names=5), 'action_names'),
+    (lambda c: c.update(houses='7'), 'houses'),
+    (lambda c: c.update(houses=[1.5]), 'houses'),
+    (lambda c: c.update(frames='many'), 'frames'),
+    (lambda c: c.update(camera_fov_deg=10**400), 'camera_fov_deg'),
+    (lambda c: c.update(stop_threshold=[]), 'stop_threshold'),
+    (lambda c: c.update(decoding={}), 'decoding'),
+    (lambda c: c.update(format=[2]), 'format'),
+    (lambda c: c.update(results=[]), 'results'),
+])
+def test_values_of_a_wrong_type_or_size_are_one_line(tmp_path, change, word):
+    save_checkpoint(tmp_path / 'model', Policy(SMALL), FACTS)
+    path = tmp_path / 'model' / 'config.json'
+    config = json.loads(path.read_text())
+    del config['config_sha256']
+    change(config)
+    path.write_text(json.dumps(config))
+    with pytest.raises(UserError, match=word) as caught:
+        load_checkpoint(tmp_path / 'model')
+    assert len(str(caught.value)) < 700 and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('content, word', [
+    (b'{"format": 2, "notes": "\xe9"}', 'UTF-8'),  # Latin-1
+    (b'{"format": 2, "format": 2}', 'twice'),
+    (b'{"format": 2, "minutes": NaN}', 'NaN'),
+    (b'[' * 200_000, 'JSON'),
+    (b'[1, 2]', 'mapping'),
+    (b'{"format": ' + b'9' * 5_000 + b'}', 'JSON'),
+    (b'"' + b'a' * 5_000_000 + b'"', '4 MB'),
+])
+def test_a_configuration_that_is_no_document_is_one_line(tmp_path, content, word):
+    save_checkpoint(tmp_path / 'model', Policy(SMALL), FACTS)
+    (tmp_path / 'model' / 'config.json').write_bytes(content)
+    with pytest.raises(UserError, match=word) as caught:
+        load_checkpoint(tmp_path / 'model')
+    assert len(str(caught.value)) < 700 and '\n' not in str(caught.value)
+
+
+def test_weights_of_an_absurd_size_are_not_read(tmp_path):
+    save_checkpoint(tmp_path / 'model', Policy(SMALL), FACTS)
+    with (tmp_path / 'model' / 'model.safetensors').open('r+b') as file:
+        file.truncate(1 << 40)  # a terabyte of nothing
+    with pytest.raises(UserError, match='at most'):
+        load_checkpoint(tmp_path / 'model')
 
 
 @pytest.mark.parametrize('actions', [

@@ -4,8 +4,6 @@ import json
 import sys
 
 import numpy as np
-import onnx
-import onnxruntime
 import pytest
 import torch
 
@@ -17,6 +15,9 @@ from vn_nav.policy.checkpoint_info import INFO
 from vn_nav.policy.export import OPSET, export_onnx
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+
+onnx = pytest.importorskip('onnx', reason='expected: onnx, of the extra `onnx`, is not installed')
+onnxruntime = pytest.importorskip('onnxruntime', reason='expected: onnxruntime is not installed')
 
 STEPS, RESET = 20, 11
 FACTS = {'world_version': '1', 'camera_fov_deg': 75.0, 'camera_height': 0.4,

@@ -13,8 +13,9 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 # The leaves that the simulator may use, and what its node shares with the other nodes.
 LEAVES = {'vn_nav.arrival', 'vn_nav.errors', 'vn_nav.goal_picture', 'vn_nav.observation',
-          'vn_nav.overlap', 'vn_nav.resources', 'vn_nav.robot'}
-NODE_SHARED = {'vn_nav.nodes.process', 'vn_nav.nodes.qos'}
+          'vn_nav.overlap', 'vn_nav.resources', 'vn_nav.robot', 'vn_nav.structured_file'}
+NODE_SHARED = {'vn_nav.nodes.parameters', 'vn_nav.nodes.policy_parameters',
+               'vn_nav.nodes.process', 'vn_nav.nodes.qos'}
 
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob('*.py'))
 
@@ -140,8 +141,8 @@ sys.exit(cli.main(sys.argv[1:]))
 @pytest.mark.parametrize('words', [
     ['bag', '--help'], ['--version'], ['--help'],
     ['bag', 'doctor', 'BAG', '--checkpoint', 'models/house'], ['bag', 'recover', 'BAG', 'OUT'],
-    ['bag', 'show', 'BAG', '--out', 'OUT'], ['bag', 'export', 'BAG', '--lerobot', 'OUT'],
-    ['compare', '--help'], ['evaluate', '--help']], ids=' '.join)
+    ['bag', 'show', 'BAG', '--out', 'OUT'], ['bag', 'export', 'BAG', '--lerobot', 'OUT']],
+    ids=' '.join)
 def test_a_look_into_a_bag_takes_neither_torch_nor_numba_nor_a_gigabyte(tmp_path, words):
     if 'export' in words and importlib.util.find_spec('pyarrow') is None:
         pytest.skip('expected: pyarrow is an extra')

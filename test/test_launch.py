@@ -30,7 +30,7 @@ def test_launch_file(path):
     functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
     assert 'generate_launch_description' in functions
     declared = {ast.literal_eval(call.args[0]) for call in calls(tree, 'DeclareLaunchArgument')}
-    assert declared >= ARGUMENTS, 'the arguments are those of Nav2'
+    assert declared == ARGUMENTS, 'the arguments are those of Nav2, and none is overridden'
     used = {ast.literal_eval(call.args[0]) for call in calls(tree, 'LaunchConfiguration')
             if isinstance(call.args[0], ast.Constant)}
     assert used <= declared, 'an argument is used and not declared'
@@ -45,3 +45,10 @@ def test_which_profile_each_file_uses():
     assert 'fastdds_multihost.xml' in drive and 'fastdds_localhost.xml' not in drive
     assert "'fastdds_localhost.xml'" in sim and 'multihost' not in sim
     assert 'drive.launch.py' in sim
+
+
+def test_nothing_activates_the_node_behind_an_operators_back():
+    """The node configures and activates itself once; no handler of the launch does it later."""
+    for path in FILES:
+        assert 'TRANSITION_ACTIVATE' not in path.read_text()
+        assert 'OnStateTransition' not in path.read_text()

@@ -34,7 +34,7 @@ class Rig:
 
     def arm(self):
         """A goal, and a bit more than a second of frames."""
-        self.navigator.new_goal((1, 0))
+        self.navigator.new_goal()
         self.navigator.accept_goal(-np.inf)
         for _ in range(22):
             self.now += DT
@@ -60,7 +60,7 @@ def rig():
 def test_enabling_says_what_is_missing(rig):
     done, message = rig.navigator.enable(rig.now)
     assert not done and 'goal_image' in message and 'image_raw' in message
-    rig.navigator.new_goal((1, 0))
+    rig.navigator.new_goal()
     rig.navigator.accept_goal(-np.inf)
     rig.frame()
     done, message = rig.navigator.enable(rig.now)
@@ -133,9 +133,7 @@ def test_a_new_goal_holds_and_begins_a_new_episode(rig):
     rig.arm()
     rig.decide()
     assert rig.step().any()
-    assert not rig.navigator.new_goal((1, 0))  # the same stamp is the same goal
-    assert rig.step().any()
-    assert rig.navigator.new_goal((2, 0))
+    rig.navigator.new_goal()
     rig.frame()
     assert not rig.step().any() and rig.navigator.state is State.HOLD
     rig.navigator.accept_goal(-np.inf)
@@ -148,7 +146,7 @@ def test_a_decision_for_the_old_goal_is_discarded(rig):
     rig.arm()
     rig.step()
     ticket = rig.frame()
-    rig.navigator.new_goal((2, 0))
+    rig.navigator.new_goal()
     rig.navigator.accept_goal(-np.inf)
     rig.navigator.decided(ticket, 0, rig.now)
     assert not rig.step().any()
@@ -156,7 +154,7 @@ def test_a_decision_for_the_old_goal_is_discarded(rig):
 
 
 @pytest.mark.parametrize('stamp, reason', [
-    (99.0, 'older'), (100.2, 'ahead'), (99.94, None)])
+    (99.0, 'old'), (100.2, 'ahead'), (99.94, None)])
 def test_stamps_are_judged(rig, stamp, reason):
     assert rig.navigator.admit(stamp, rig.now) == (reason is None)
     if reason:
@@ -167,7 +165,7 @@ def test_duplicate_and_reordered_frames_are_dropped(rig):
     assert rig.navigator.admit(100.0, 100.0)
     assert not rig.navigator.admit(100.0, 100.0)
     assert not rig.navigator.admit(99.99, 100.0)
-    assert rig.navigator.dropped['reordered or duplicate stamp'] == 2
+    assert rig.navigator.dropped == {'reordered stamp': 2}
 
 
 def test_three_bad_frames_in_a_row_stop(rig):
@@ -220,7 +218,7 @@ def test_nobody_drives_blind_when_odometry_falls_silent(rig):
 
 def test_a_clock_that_goes_back_disarms(rig):
     rig.arm()
-    rig.navigator.time_jumped()
+    rig.navigator.time_jumped('the clock went back by 5 s')
     assert not rig.step().any() and rig.navigator.state is State.IDLE
 
 
@@ -256,9 +254,8 @@ def test_a_declared_arrival_stands_until_there_is_another_goal(continuous):
     for _ in range(60):
         assert rig.frame_later() is None  # nothing is decided
         assert np.array_equal(rig.step(), np.zeros(4))
-    assert not rig.navigator.new_goal((1, 0))  # the same picture again
-    assert rig.navigator.state is State.ARRIVED
-    assert rig.navigator.new_goal((2, 0)) and rig.navigator.arrival is None
+    rig.navigator.new_goal()
+    assert rig.navigator.state is State.HOLD and rig.navigator.arrival is None
     rig.navigator.accept_goal(-np.inf)
     rig.decide()
     assert rig.step().any() and rig.navigator.decisions == 1
@@ -296,7 +293,7 @@ def test_camera_and_odometry_are_watched_where_it_arrived(rig):
     (lambda navigator, now: navigator.stop('~/stop was called', now), State.STOPPED),
     (lambda navigator, now: navigator.disable(), State.IDLE),
     (lambda navigator, now: navigator.reset(), State.IDLE),
-    (lambda navigator, now: navigator.time_jumped(), State.IDLE)])
+    (lambda navigator, now: navigator.time_jumped('the clock went back'), State.IDLE)])
 def test_orders_of_people_come_before_arrival(rig, order, state):
     rig.arm()
     ticket = None

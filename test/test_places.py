@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import imitation_loss
 from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spots
-from vn_nav.learning.teach import _widened
+from vn_nav.learning.teaching import _widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.policy.places import HEADINGS, LookAround

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from vn_nav.learning.hindsight import Drives, partners, rows_of, split
 from vn_nav.learning.pairs import errors, measure
 from vn_nav.learning.pretrain import STATE, PretrainConfig, choose_parts, pretrain
 from vn_nav.learning.state_file import read_state
-from vn_nav.learning.supervised import Batch, Objective, Tally
+from vn_nav.learning.supervised import Batch, Guess, Objective, Tally
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.heads import Pose
 from vn_nav.policy.network import NetworkConfig, Policy
@@ -232,6 +233,41 @@ def test_numbers_out_of_range_are_refused():
             PretrainConfig(**{name: value})
 
 
+def test_the_baseline_is_a_guess_without_pictures_on_the_same_steps(tmp_path):
+    """The most frequent action that was learned from, and the mean pose of overlapping pairs."""
+    drives, rows = Drives([drive_set(20)], ROBOT), []
+    parts = split(drives, 0.15, 0)
+    learned, judged = (drives.action[rows_of(spans)] for spans in (parts.train, parts.validation))
+    often = np.bincount(learned[learned >= 0]).argmax()
+    folder = learn(drives, tmp_path, network=network_of(('goal_pose',)), on_epoch=rows.append)
+    # Every step of the validation's windows that acts is judged once, but for where windows end.
+    share = (judged[judged >= 0] == often).mean()
+    assert abs(rows[0]['baseline_action_accuracy'] - share) < 0.1
+    assert rows[0]['baseline_action_accuracy'] == rows[-1]['baseline_action_accuracy']
+    assert 0 < rows[0]['baseline_bearing_deg'] < 120 and rows[0]['baseline_overlap_accuracy'] > 0.5
+    results = load_checkpoint(folder).info['results']
+    assert list(results) == ['pre-training, validation steps',
+                             'the same steps, a guess without pictures']
+    own, guessed = results.values()
+    assert guessed['action_accuracy'] == rows[0]['baseline_action_accuracy']
+    assert guessed.keys() < own.keys()
+
+
+def test_of_a_tally_the_guess_is_judged_on_what_was_counted():
+    tally = Tally()
+    assert tally.baseline(Guess(1, np.zeros(4), True)) == {}
+    tally.add('cloning', torch.tensor(1.0), 5)
+    tally.add_actions(torch.tensor([True, False, True]), torch.tensor([1, 1, 0]))
+    tally.add_actions(torch.tensor([True, True]), torch.tensor([3, 1]))
+    again = Tally()
+    again.load_state_dict(tally.state_dict())
+    for own in (tally, again):
+        assert own.baseline(Guess(1, np.zeros(4), True)) == {'action_accuracy': 0.6}
+        assert own.baseline(Guess(2, np.zeros(4), True)) == {'action_accuracy': 0.0}
+        assert own.figures(lambda part: 1.0)['action_accuracy'] == 0.8
+        assert own.baseline(Guess(None, np.zeros(4), True)) == {}
+
+
 def test_a_loss_that_is_not_finite_ends_it_and_the_last_save_stays_whole(tmp_path):
     config = PretrainConfig(epochs=2, window=8, learning_rate=1e30)
     with pytest.raises(UserError, match='stay finite'):
@@ -255,6 +291,14 @@ def test_from_collected_bag_to_pre_training_to_reinforcement(tmp_path, capsys):
     saved = load_checkpoint(tmp_path / 'run' / 'checkpoint')
     assert {'goal_pose', 'depth', 'goal_segmentation'} <= set(saved.config.heads)
     assert saved.info['preset'] == 'fast' and 'pretrain' not in saved.info['results']
+    assert 'a line an epoch' in said and 'bearing off by deg: median' in said
+    assert 'right actions' not in said  # nothing acts
+    # The card: which data, how many pictures, which losses, and no word of success.
+    card = (tmp_path / 'run' / 'checkpoint' / 'README.md').read_text()
+    assert re.search(r'\| 64 recorded pictures of bag: \d+ steps to learn from, \d+ others', card)
+    assert '| Losses | depth, segmentation, goal segmentation, goal pose |' in card
+    assert 'No episode was driven' in card and 'begin a training' in card
+    assert 'success' not in card and 'Drives a robot' not in card and '0 frames' not in card
     # The policy node runs it, and training goes on from it.
     runtime = PolicyRuntime(tmp_path / 'run' / 'checkpoint')
     picture = np.zeros((3, 36, 36), np.uint8)

@@ -2,6 +2,11 @@
 
 import json
 import math
+import re
+import signal
+import subprocess
+import sys
+import time
 
 import cv2
 import numpy as np
@@ -22,11 +27,15 @@ from small_bags import (
 )
 
 from vn_msgs_py.topics import topic
+from vn_nav.bags.pose_graph import between, compose
 from vn_nav.bags.recorder import BagWriter
 from vn_nav.cli import main
 from vn_nav.errors import UserError
+from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.presets import preset
-from vn_nav.learning.teach import OWN
+from vn_nav.learning.stages import Stages
+from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.learning.teaching import OWN
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -139,6 +148,7 @@ def test_picture_pairs_come_first_and_after_the_weights_of_a_checkpoint(graph, t
     (['--checkpoint', 'models/house', '--size', '32'], 'size is that of the checkpoint'),
     (['--checkpoint', 'nowhere'], 'a checkpoint is a folder'),
     (['--places', '1'], '2 to 1024 spots'),
+    (['--pictures', '9-3'], 'ranges in their order'),
     (['--robot', 'nowhere.yaml'], 'a robot file exists'),
     (['--topics', 'nowhere.yaml'], 'in a YAML file'),
     (['--set', 'teacher=nobody'], 'the teacher is one of'),
@@ -197,6 +207,7 @@ def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, ba
                                                            capsys):
     model = write_checkpoint(tmp_path / 'model', size=SIZE)
     config = json.loads((model / CONFIG).read_text()) | known
+    del config['config_sha256']  # changed on purpose
     (model / CONFIG).write_text(json.dumps(config))
     assert main(['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
                  '--goals', '8', '--episodes', '1', '--max-decisions', '2', '--no-controls',
@@ -214,12 +225,122 @@ def test_the_robot_needs_the_actions_of_the_checkpoint(driven, tmp_path, capsys)
     assert 'how far forward moves the robot' in capsys.readouterr().err
 
 
+@pytest.fixture(scope='module')
+def houses():
+    """Poses and pictures of drives through two houses, each from where its odometry begins."""
+    found = []
+    for house in (12007, 12008):
+        poses, pictures = drive(200, rooms=3, house=house, size=96)
+        found.append((between(poses[:1], poses), pictures))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('joint', ['odometry starts again', 'odometry goes on'])
+def test_two_houses_are_no_one_place(joint, houses, tmp_path, capsys):
+    """They are refused with the pictures of each; one of them alone can be learned."""
+    (one, first), (other, second) = houses
+    if joint == 'odometry goes on':
+        other = np.array([compose(one[-1], pose) for pose in other])
+    bag = write_bag(tmp_path / 'bag', np.concatenate([one, other]),
+                    np.concatenate([first, second]))
+    words = ['teach', str(bag), '--out', str(tmp_path / 'out'), '--checkpoint', 'models/anywhere',
+             '--minutes', '0.05', '--episodes', '1']
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert '2 that have nothing in common' in said and said.count('\n') == 1
+    assert not (tmp_path / 'out' / 'checkpoint').exists()
+    own = re.search(r'learn one place with --pictures (\d+)-(\d+)', said)
+    assert own[1] == '1' and abs(int(own[2]) - len(one)) <= 20
+    assert main([*words, '--pictures', f'{own[1]}-{len(one)}']) == 0
+    assert 'moved by up to' in capsys.readouterr().out
+    info = load_checkpoint(tmp_path / 'out' / 'checkpoint').info
+    assert f'pictures 1-{len(one)}' in info['notes'] and 'recorded pictures' in info['data']
+    assert 'no episode was driven' in (tmp_path / 'out' / 'checkpoint' / 'README.md').read_text()
+    # Odometry alone shows a jump, and what goes on it cannot tell apart.
+    assert main(['evaluate', 'models/anywhere', '--bag', str(bag), '--no-straighten', '--episodes',
+                 '1', '--max-decisions', '2', '--no-controls']) == (
+                     2 if joint == 'odometry starts again' else 0)
+
+
+def test_rows_and_episodes_are_as_many_as_there_is_time_for():
+    network, before = (load_checkpoint('models/anywhere').network for _ in range(2))
+    rows = rows_of(['seen_goals', 'unseen_goals'], network, before)
+    assert rows[0] == Row('seen_goals', 'arrival', RIGHT) and len(rows) == 20
+    assert not any(row.name == BEFORE for row in rows_of(['seen_goals'], network, None))
+    costs = [Cost(LEAST, 0.01, 0.01), Cost(50, 0.055, 0.01)]  # a thousandth of a second a robot
+
+    def needed(some, envs):
+        return sum(300 * (0.01 + (row.name not in (SHORTEST, 'random actions'))
+                          * (0.005 + 0.001 * envs)) for row in some)
+    whole = plan(rows, costs, 50, math.inf, 300)
+    assert whole.episodes == 50 and whole.rows == rows and not whole.missing
+    assert math.isclose(whole.seconds, needed(rows, 50))
+    some = plan(rows, costs, 50, needed(rows, 20) + 0.01, 300)
+    assert some.episodes == 20 and some.rows == rows
+    few = plan(rows, costs, 50, needed(rows[:7], LEAST) + 0.01, 300)
+    assert few.episodes == LEAST and few.rows == rows[:7] and few.missing == rows[7:]
+    none = plan(rows, costs, 50, -1.0, 300)
+    assert none.rows == rows[:1] and none.episodes == LEAST
+    assert plan(rows, costs, 3, -1.0, 300).episodes == 3
+    many = plan(rows, costs, 2 * ENVIRONMENTS, math.inf, 300)  # two rounds
+    assert math.isclose(many.seconds, 2 * whole.seconds)
+
+
+def test_a_signal_ends_a_stage_between_two_steps_and_a_second_one_at_once(capsys):
+    before = signal.getsignal(signal.SIGINT)
+    with Stages(1.0) as stages:
+        stages('learning', 0.0)
+        signal.raise_signal(signal.SIGINT)
+        done = True  # what is under way is not torn apart
+        with pytest.raises(KeyboardInterrupt):
+            stages('learning', 0.5)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    assert done and signal.getsignal(signal.SIGINT) is before
+    assert 0 < stages.left < 60 and 'of 1 min · learning' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(('sign', 'kept'), [
+    ('learning the place', 'not measured'), ('learning the ways', 'not measured'),
+    ('arrival · right goal', 'of 20 rows')])
+def test_after_sigint_there_is_a_whole_checkpoint_and_the_rows_so_far(sign, kept, bag, tmp_path):
+    out = tmp_path / 'out'
+    with open(tmp_path / 'said', 'w') as said:
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'vn_nav.cli', 'teach', str(bag), '--out', str(out),
+             '--checkpoint', 'models/anywhere', '--goals', '8', '--cache', str(tmp_path / 'cache'),
+             '--minutes', '10' if sign == 'learning the place' else '0.7'], stdout=said,
+            stderr=subprocess.STDOUT)
+    try:
+        until = time.monotonic() + 240
+        while sign not in (tmp_path / 'said').read_text():
+            assert process.poll() is None and time.monotonic() < until
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    finally:
+        process.kill()
+    words = (tmp_path / 'said').read_text()
+    assert kept in words and 'Traceback' not in words
+    taught = load_checkpoint(out / 'checkpoint')
+    if kept == 'of 20 rows':
+        rows = json.loads((out / 'evaluation.json').read_text())['splits']['seen_goals']['rows']
+        assert RIGHT in rows['arrival'] and any('seen_goals' in name for name in
+                                                taught.info['results'])
+        assert '<svg' in (out / 'evaluation.html').read_text()
+    else:
+        assert not (out / 'evaluation.json').exists()
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_a_minute_in_the_pictures_of_a_drive_beats_chance(tmp_path):
+def test_minutes_in_the_pictures_of_a_drive_beat_chance(tmp_path, capsys):
     bag = write_bag(tmp_path / 'bag', *drive(160, rooms=2))
     out = tmp_path / 'out'
-    assert main(['teach', str(bag), '--out', str(out), '--size', str(SIZE), '--minutes', '1.5',
+    assert main(['teach', str(bag), '--out', str(out), '--size', str(SIZE), '--minutes', '2.5',
                  '--goals', '12', '--envs', '32', '--set', 'hidden=128', '--set', 'features=128',
                  '--episodes', '32']) == 0
     result = json.loads((out / 'evaluation.json').read_text())
@@ -227,6 +348,8 @@ def test_a_minute_in_the_pictures_of_a_drive_beats_chance(tmp_path):
     success = {name: row['success'] for name, row in rows.items()}
     assert success['right goal, sample'] > success['random actions'] + 0.2
     assert success['shortest path'] > 0.95
+    said = capsys.readouterr().out
+    assert 'learning' in said and 'evaluation' in said and '2.5 minutes: reading the bag' in said
     loaded = load_checkpoint(out / 'checkpoint')
     assert loaded.config.size == SIZE and loaded.info['world_version'] == WORLD_VERSION
     assert loaded.info['stop_threshold'] == 0.5 and 'Taught in the pictures' in (
@@ -244,7 +367,7 @@ def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, caps
     bag, out = write_bag(tmp_path / 'bag', *driven), tmp_path / 'out'
     given = load_checkpoint('models/anywhere')
     assert main(['teach', str(bag), '--out', str(out), '--checkpoint', 'models/anywhere',
-                 '--minutes', '0.05', '--goals', '8', '--episodes', '1']) == 0
+                 '--minutes', '0.8', '--goals', '8', '--episodes', '1']) == 0
     said = capsys.readouterr().out
     assert 'the advised action loses' in said and 'on others' in said
     taught = load_checkpoint(out / 'checkpoint')

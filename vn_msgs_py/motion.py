@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 
+FARTHEST_M = 1e8  # m: UTM coordinates are within; a pose beyond is a driver's fault
+FASTEST = 1e3  # m/s, rad/s
+
 
 class MotionError(ValueError):
     """A motion message that must not move a robot: states rule, value and remedy."""
@@ -49,7 +52,8 @@ def odometry_to_array(message: Any) -> np.ndarray:
     """Odometry to [7] float64: x, y [m], yaw [rad], vx, vy [m/s], wz [rad/s], stamp [s].
 
     Raises:
-        MotionError: NaN or infinity, or a quaternion that is none.
+        MotionError: NaN or infinity, a number beyond what any robot does, or a quaternion that
+            is none.
     """
     pose, twist = message.pose.pose, message.twist.twist
     q = pose.orientation
@@ -59,6 +63,9 @@ def odometry_to_array(message: Any) -> np.ndarray:
                        message.header.stamp.sec + message.header.stamp.nanosec * 1e-9])
     if not np.isfinite(values).all():
         raise MotionError('odometry is finite', values.tolist(), 'check the base driver')
+    if np.abs(values[:2]).max() > FARTHEST_M or np.abs(values[3:6]).max() > FASTEST:
+        raise MotionError(f'a pose lies within {FARTHEST_M:g} m, and no robot is faster than '
+                          f'{FASTEST:g} m/s', values.tolist(), 'check the base driver')
     return values
 
 

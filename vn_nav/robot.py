@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import reprlib
 from pathlib import Path
 
-import yaml
-
 from vn_nav.errors import UserError
+from vn_nav.structured_file import read_yaml
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +26,12 @@ class Action:
     dpitch: float = 0.0  # rad, down; carried by Twist.angular.y
 
     def __post_init__(self):
+        if not isinstance(self.name, str) or not 0 < len(self.name) <= NAME_LENGTH:
+            raise UserError(f'an action has a name of 1 to {NAME_LENGTH} characters',
+                            reprlib.repr(self.name), 'correct the robot file')
+        for axis in AXES:
+            _check_number(f'{axis} of action {self.name}', getattr(self, axis), -MAX_MOVE,
+                          MAX_MOVE)
         moved = [axis for axis in AXES if getattr(self, axis)]
         if len(moved) != 1:
             raise UserError(
@@ -33,9 +39,6 @@ class Action:
                 dataclasses.asdict(self),
                 'split it into several actions',
             )
-        if not math.isfinite(getattr(self, moved[0])):
-            raise UserError('an action is finite', dataclasses.asdict(self),
-                            'correct the robot file')
 
     @property
     def axis(self) -> str:
@@ -49,6 +52,25 @@ class Action:
 
 
 AXES = ('dx', 'dy', 'dyaw', 'dpitch')
+NAME_LENGTH = 100  # characters
+MAX_ACTIONS = 256
+MAX_MOVE = 100.0  # m or rad, of an action
+SMALLEST = 1e-3  # of what is positive, in the field's unit
+# What no robot of ours goes beyond, in the field's unit: a slip of units or of a digit.
+LARGEST = {
+    'footprint_radius': 10.0, 'camera_height': 100.0, 'camera_fov': math.radians(179),
+    'camera_pitch': math.pi / 2, 'max_linear': 20.0, 'max_angular': 50.0,
+    'linear_acceleration': 200.0, 'angular_acceleration': 500.0,
+}
+
+
+def _check_number(name: str, value: object, least: float, most: float) -> None:
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise UserError(f'{name} is a number', reprlib.repr(value), 'correct the robot file')
+    if not least <= value <= most:  # not a number is neither
+        raise UserError(f'{name} lies between {least:g} and {most:g}', value,
+                        'correct the robot file; angles in degrees end in _deg')
+
 
 # Thesis, section 5.6 and table 5.5: the actions of the continuous environments.
 THESIS_ACTIONS = (
@@ -81,13 +103,15 @@ class RobotSpec:
     angular_acceleration: float = 1.6  # rad/s^2
 
     def __post_init__(self):
-        positive = ('footprint_radius', 'camera_height', 'camera_fov', 'max_linear', 'max_angular',
-                    'linear_acceleration', 'angular_acceleration')
-        for field in positive:
-            value = getattr(self, field)
-            if not (math.isfinite(value) and value > 0):
-                raise UserError(f'{field} of a robot is finite and positive', value,
-                                f'correct {field} of robot {self.name!r}')
+        if not isinstance(self.name, str) or len(self.name) > NAME_LENGTH:
+            raise UserError(f'the name of a robot is text of at most {NAME_LENGTH} characters',
+                            reprlib.repr(self.name), 'correct the robot file')
+        for field, most in LARGEST.items():
+            least = -most if field == 'camera_pitch' else SMALLEST
+            _check_number(f'{field} of robot {self.name!r}', getattr(self, field), least, most)
+        if len(self.actions) > MAX_ACTIONS:
+            raise UserError(f'a robot has at most {MAX_ACTIONS} actions', len(self.actions),
+                            f'correct the actions of robot {self.name!r}')
         if len(set(self.action_names)) != len(self.actions) or not self.actions:
             raise UserError('a robot has at least one action, each with its own name',
                             self.action_names, f'correct the actions of robot {self.name!r}')
@@ -154,38 +178,41 @@ def load_robot(path: str | Path) -> RobotSpec:
     """Read a robot from YAML: the fields of `RobotSpec`; angles in degrees end in `_deg`.
 
     Raises:
-        UserError: a missing file, an unknown field or a value outside its range.
+        UserError: a missing file, one that is no YAML mapping in UTF-8 or has a key twice, an
+            unknown field, or a value of a wrong type or outside its range.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError('a robot file exists', str(path), 'see config/robots/ for examples')
+    data = read_yaml(path, 'a robot file', 'see config/robots/ for examples')
     try:
-        data = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise UserError('a robot file is YAML', f'{path}: {error}', 'correct the file') from error
-    if not isinstance(data, dict):
-        raise UserError('a robot file is a YAML mapping', f'{path}: {type(data).__name__}',
-                        'see config/robots/ for examples')
-    data = _degrees_to_radians(data, path)
-    try:
+        data = _degrees_to_radians(data)
         if 'actions' in data:
-            data['actions'] = tuple(
-                Action(**_degrees_to_radians(action, path)) for action in data['actions'])
+            entries = data['actions']
+            if not (isinstance(entries, list) and all(map(_is_mapping, entries))):
+                raise UserError('actions is a list of mappings, such as {name: forward, dx: 0.5}',
+                                reprlib.repr(entries), 'see config/robots/ for examples')
+            data['actions'] = tuple(Action(**_degrees_to_radians(entry)) for entry in entries)
         return RobotSpec(**data)
     except TypeError as error:
         known = ', '.join(field.name for field in dataclasses.fields(RobotSpec))
         raise UserError('a robot file has only known fields', f'{path}: {error}',
                         f'the fields are {known}') from error
+    except UserError as error:
+        raise UserError(error.rule, f'{path}: {error.received}', error.remedy) from error
 
 
-def _degrees_to_radians(data: dict, path: Path) -> dict:
+def _is_mapping(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(key, str) for key in value)
+
+
+def _degrees_to_radians(data: dict) -> dict:
     out = {}
     for key, value in data.items():
-        if key.endswith('_deg'):
-            if not isinstance(value, (int, float)):
-                raise UserError(f'{key} is a number of degrees', f'{path}: {value!r}',
-                                'correct the file')
-            out[key.removesuffix('_deg')] = math.radians(value)
-        else:
-            out[key] = value
+        name = key.removesuffix('_deg')
+        if name != key:
+            _check_number(key, value, -36_000.0, 36_000.0)
+            value = math.radians(value)
+        if name in out:
+            raise UserError('a value is given once, in degrees or in radians', key,
+                            f'leave out {name} or {name}_deg')
+        out[name] = value
     return out

@@ -14,7 +14,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
@@ -24,7 +23,8 @@ from std_srvs.srv import Trigger
 
 from vn_msgs_py import images, motion
 from vn_nav.errors import UserError
-from vn_nav.nodes.process import Ended, run_node
+from vn_nav.nodes import parameters, policy_parameters
+from vn_nav.nodes.process import Ended, compiling, run_node
 from vn_nav.nodes.qos import qos
 from vn_nav.robot import RobotSpec, load_robot
 from vn_sim_bridge import tasks
@@ -40,25 +40,30 @@ LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base 
 STATEMENT_PATIENCE = 2.0  # s of wall time, see _on_arrived
 OPTICAL_FRAME = 'camera_optical_frame'
 
-# name: (default, meaning); the types of the defaults are the types of the parameters.
+# name: (default, meaning, limits), as in `vn_nav.nodes.parameters`.
 PARAMETERS = {
-    'backend': ('house', 'simulator behind the bridge: house'),
+    'backend': ('house', 'simulator behind the bridge: house', ('house',)),
     'house': (0, 'seed of the house'),
-    'rooms': (5, 'number of rooms, 1 to 12'),
+    'rooms': (5, 'number of rooms', (1, 12)),
     'robot': ('', 'YAML file of the robot; empty: the standard robot'),
-    'size': (84, 'side of the square camera picture [pixels]'),
+    'size': (84, 'side of the square camera picture [pixels]', (16, 1024)),
     'noise': (True, 'Gaussian motion noise, which odom does not see'),
-    'odometry_drift': (0.0, 'errors of odom: 0 none, 1 as of a good indoor robot, more: worse'),
+    'odometry_drift': (0.0, 'errors of odom: 0 none, 1 as of a good indoor robot, more: worse',
+                       (0.0, 1000.0)),
     'randomisation': ('none', 'of light, camera and base: none, standard, rough or a YAML file'),
     'goals': ('', 'folder of goal pictures with their poses (goals.json); empty: the own ones'),
     'seed': (0, 'of starts, goals and noise'),
-    'time': ('real_time', 'real_time or lock_step (docs/architecture.md, "Time")'),
-    'mode': ('stop_and_go', 'lock_step: stop_and_go shows pictures at rest, continuous always'),
-    'camera_rate': (10.0, 'pictures per simulated second in real_time and in continuous [Hz]'),
-    'episodes': (0, 'episodes to run; 0: without end'),
-    'max_decisions': (300, 'limit of an episode'),
-    'stop': ('arrival', 'what ends an episode before its limit: arrival, or declared: `arrived`'),
-    'start_time': (1.0, 'first stamp [s]; zero would mean "no time yet"'),
+    'time': ('real_time', 'real_time or lock_step (docs/architecture.md, "Time")',
+             ('real_time', 'lock_step')),
+    'mode': ('stop_and_go', 'lock_step: stop_and_go shows pictures at rest, continuous always',
+             ('stop_and_go', 'continuous')),
+    'camera_rate': (10.0, 'pictures per simulated second in real_time and in continuous [Hz]',
+                    (1.0, 1 / TICK)),
+    'episodes': (0, 'episodes to run; 0: without end', (0, 2**31 - 1)),
+    'max_decisions': (300, 'limit of an episode', (1, 2**31 - 1)),
+    'stop': ('arrival', 'what ends an episode before its limit: arrival, or declared: `arrived`',
+             tuple(STOPS)),
+    'start_time': (1.0, 'first stamp [s]; zero would mean "no time yet"', (TICK, 2e9)),
     'exit_when_done': (False, 'exit after the last episode instead of standing still'),
 }
 
@@ -66,13 +71,10 @@ PARAMETERS = {
 class SimBridgeNode(Node):
     """Publishes what a robot's drivers would, and judges episodes on the side."""
 
-    def __init__(self):
+    def __init__(self, ended: Ended):
         super().__init__('sim_bridge_node')
-        values = {}
-        for name, (default, meaning) in PARAMETERS.items():
-            descriptor = ParameterDescriptor(description=meaning, read_only=True)
-            values[name] = self.declare_parameter(name, default, descriptor).value
-        self._check(values)
+        values = parameters.declare(self, PARAMETERS, read_only=True,
+                                    others=policy_parameters.PARAMETERS)
         self.lock_step = values['time'] == 'lock_step'
         self.pictures_in_motion = not self.lock_step or values['mode'] == 'continuous'
         self.continuous = values['mode'] == 'continuous'
@@ -80,12 +82,15 @@ class SimBridgeNode(Node):
         self.picture_ticks = max(1, round(1 / (values['camera_rate'] * TICK)))
         robot = load_robot(values['robot']) if values['robot'] else RobotSpec()
         self.goals = load_goal_pictures(values['goals']) if values['goals'] else []
-        self.robot = SimulatedRobot(
-            values['house'], values['rooms'], robot=robot, size=values['size'],
-            noise=values['noise'], seed=values['seed'], max_decisions=values['max_decisions'],
-            stop=values['stop'], randomisation=load_randomisation(values['randomisation']),
-            odometry_drift=values['odometry_drift'],
-            goal_poses=[goal.pose for goal in self.goals] or None)
+        work = f'making house {values["house"]}; the first start compiles the renderer, a minute'
+        with compiling(self, ended, work):
+            self.robot = SimulatedRobot(
+                values['house'], values['rooms'], robot=robot, size=values['size'],
+                noise=values['noise'], seed=values['seed'],
+                max_decisions=values['max_decisions'], stop=values['stop'],
+                randomisation=load_randomisation(values['randomisation']),
+                odometry_drift=values['odometry_drift'],
+                goal_poses=[goal.pose for goal in self.goals] or None)
         self.size, self.start_time = values['size'], values['start_time']
         self.command = np.zeros(4)
         self.command_tick = 0  # when the newest command came, in ticks
@@ -95,29 +100,12 @@ class SimBridgeNode(Node):
         self.says_arrived = self.goal_taken = False  # the policy, in this episode
         self.goal_shown = 0.0  # steady time [s]
         self._make_interfaces()
-        self.begin_episode(0)
-
-    @staticmethod
-    def _check(values: dict) -> None:
-        rules = (
-            ('backend', values['backend'] == 'house', 'the backend is one of: house'),
-            ('time', values['time'] in ('real_time', 'lock_step'),
-             'time is real_time or lock_step'),
-            ('mode', values['mode'] in ('stop_and_go', 'continuous'),
-             'mode is stop_and_go or continuous'),
-            ('camera_rate', 1.0 <= values['camera_rate'] <= 1 / TICK,
-             f'camera_rate lies between 1 and {1 / TICK:.0f} Hz'),
-            ('odometry_drift', 0 <= values['odometry_drift'] < math.inf,
-             'odometry_drift is 0 (none) or more'),
-            ('size', 16 <= values['size'] <= 1024, 'size lies between 16 and 1024 pixels'),
-            ('max_decisions', values['max_decisions'] >= 1, 'max_decisions is at least 1'),
-            ('stop', values['stop'] in STOPS, f'stop is {" or ".join(STOPS)}'),
-            ('start_time', values['start_time'] > 0, 'start_time is positive'),
-            ('episodes', values['episodes'] >= 0, 'episodes is 0 (without end) or more'),
-        )
-        for name, kept, rule in rules:
-            if not kept:
-                raise UserError(rule, values[name], f'set {name} with -p {name}:=...')
+        with compiling(self, ended, work):
+            self.begin_episode(0)
+        self.get_logger().info(
+            f'ready: house {values["house"]}, {values["time"]}; pictures on '
+            f'{self._image.topic_name}, waits for commands on '
+            f'{self.resolve_topic_name("cmd_vel")}')
 
     def _make_interfaces(self) -> None:
         def publisher(kind, name):
@@ -362,7 +350,8 @@ def run(node: SimBridgeNode, ended: Ended) -> None:
 
 def main(args=None) -> int:
     """Entry point. Exit code 2 and one line on standard error for bad parameters."""
-    return run_node('sim_bridge_node', SimBridgeNode, run, args)
+    return run_node('sim_bridge_node', SimBridgeNode, run, args, about=__doc__,
+                    parameters=PARAMETERS)
 
 
 if __name__ == '__main__':

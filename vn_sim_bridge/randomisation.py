@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import yaml
 
 from vn_nav.errors import UserError
 from vn_nav.resources import share_file
+from vn_nav.structured_file import read_yaml
 from vn_sim_bridge.counter_random import Stream, normal, uniform
 from vn_sim_bridge.render.pack import FACING
 
@@ -167,14 +167,7 @@ def load_randomisation(name: str | Path) -> Randomisation:
     if not path.is_file():
         raise UserError("a randomisation is 'none', 'standard', 'rough' or a YAML file", str(name),
                         'see config/randomisation/ for examples')
-    try:
-        data = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError('a randomisation file is YAML', f'{path}: {error}',
-                        'correct the file') from error
-    if not isinstance(data, dict):
-        raise UserError('a randomisation file is a YAML mapping', f'{path}: {data!r}',
-                        'see config/randomisation/ for examples')
+    data = read_yaml(path, 'a randomisation file', 'see config/randomisation/ for examples')
     known = {field.name for field in dataclasses.fields(Randomisation)}
     if unknown := sorted(set(map(str, data)) - known):
         raise UserError('a randomisation file has only known fields',

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -75,14 +77,27 @@ def make_views(graph: ImageGraph, robot: RobotSpec, seed: int
             GraphViews(graph, robot, np.flatnonzero(judged), seed + 1))
 
 
-def regrets(graph: ImageGraph, poses: np.ndarray) -> np.ndarray:
+def regrets(graph: ImageGraph, poses: np.ndarray, until: float = math.inf,
+            show: Callable[[float], None] = lambda share: None) -> np.ndarray:
     """What each first action costs more than the best, see `PoseMap.regrets_to`.
 
+    Args:
+        graph: the place.
+        poses: [N,3] where ways begin.
+        until: `time.monotonic()` after which no further goal is begun; the first goals are
+            spread over the place as all of them are.
+        show: is told the share of the goals that is done.
+
     Returns:
-        [G,N,A] float16, from poses [N,3] to each of the goals.
+        [G,N,A] float16, from the poses to the first G of the goals, one at least.
     """
-    return np.stack([graph.map.regrets_to(poses, goal.pose).astype(np.float16)
-                     for goal in graph.goals])
+    found = []
+    for goal in graph.goals:
+        if found and time.monotonic() > until:
+            break
+        show(len(found) / len(graph.goals))
+        found.append(graph.map.regrets_to(poses, goal.pose).astype(np.float16))
+    return np.stack(found)
 
 
 def draw_map(path: Path, own: ImageGraph, others: ImageGraph | None) -> None:

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rg
 from vn_nav.bags.bag_files import files_of
 from vn_nav.bags.drive import MISFIT, Cutter, Frame, Report, Step, find_topics, hear, synchronise
 from vn_nav.bags.roles import Topics
-from vn_nav.bags.stream import messages
+from vn_nav.bags.stream import messages, summary
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
 from vn_nav.robot import RobotSpec
@@ -72,7 +72,8 @@ class DriveSet:
                 zip([0, *edges], [*edges, len(self.episode)], strict=True) if b > a]
 
 
-def load_drives(bag: str | Path, wanted: Wanted, cache: str | Path) -> DriveSet:
+def load_drives(bag: str | Path, wanted: Wanted, cache: str | Path,
+                show: Callable[[float], None] = lambda share: None) -> DriveSet:
     """The steps of a bag, decoded now or from the cache.
 
     Args:
@@ -80,6 +81,7 @@ def load_drives(bag: str | Path, wanted: Wanted, cache: str | Path) -> DriveSet:
         wanted: what to make of it.
         cache: folder of decoded bags. An entry is made whole or not at all, and belongs to the
             files as they are now: a bag that changes is decoded anew.
+        show: is told the share of the pictures that is decoded.
 
     Raises:
         UserError: no readable bag, topics that it lacks, a camera narrower than the robot's, no
@@ -92,7 +94,7 @@ def load_drives(bag: str | Path, wanted: Wanted, cache: str | Path) -> DriveSet:
         shutil.rmtree(temporary, ignore_errors=True)
         try:
             temporary.mkdir(parents=True)
-            _decode(bag, wanted, temporary)
+            _decode(bag, wanted, temporary, show)
             if folder.exists():  # another process was faster, or a broken entry
                 shutil.rmtree(folder)
             temporary.rename(folder)
@@ -205,13 +207,15 @@ class _Columns:
         return self._layout
 
 
-def _decode(bag: Path, wanted: Wanted, folder: Path) -> None:
+def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], None]) -> None:
     report, columns = Report(), _Columns(folder)
     steps, facts = read_steps(bag, wanted, report)
     beside = {name: _Beside(name) for name in ('depth', 'labels') if facts['topics'][name]}
     goals: dict[bytes, int] = {}
     shown_goal, number, bad, unseen, rows = None, -1, 0, 0, []
+    held = summary(bag)[facts['topics']['image']].count or math.inf
     for step, pictures in decoded(steps, wanted, facts['fov']):
+        show(report.pictures / held)
         frame = step.frame
         if pictures is None:
             bad += 1

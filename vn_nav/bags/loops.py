@@ -11,7 +11,8 @@ say the same, and in the graph a closure loses its weight with what it contradic
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -26,10 +27,12 @@ from vn_nav.bags.pose_graph import (
     between,
     chi_squared,
     compose,
+    misfit,
     odometry_covariance,
     relative,
     solve,
 )
+from vn_nav.bags.same_place import PLAIN, TIGHT, together, unnoticed
 from vn_nav.bags.stamped import GAP
 from vn_nav.bags.two_view import Camera
 from vn_nav.robot import RobotSpec
@@ -53,7 +56,8 @@ ALIKE = 2.5  # and in the graph: closures of one place share their errors
 SPOT, TURNS, FACTOR = (0.15, 1.0), 10, (0.4, 2.5)
 BESIDE = 6  # keyframes between closures that support each other
 BESIDE_ODOMETRY = (0.05, 0.05, 0.02)  # m, m, rad: standard deviations of odometry on the way
-FEWEST = 5  # closures, or odometry stays as it is
+FEWEST = 5  # closures, or odometry stays as it is, and two stretches are no one place
+LOOKING = 0.4  # of the time, to find features
 
 CLOSURE = np.dtype([('first', np.int64), ('second', np.int64), ('matches', np.int64),
                     ('motion', np.float64, 3), ('chi', np.float64)])
@@ -64,11 +68,16 @@ class Straightened(NamedTuple):
 
     poses: np.ndarray  # [N,3] float64 x, y [m], yaw [rad]; the first is that of odometry
     closures: np.ndarray  # [K] of `CLOSURE`: pictures, matches, motion between them, chi^2
-    facts: dict  # counts; how far poses were moved [m] and turned [rad], at most
+    stretch: np.ndarray  # [N] int64, of each picture; those that were given, and what they hide
+    place: np.ndarray  # [S] int64: which of the stretches belong together
+    facts: dict  # counts; how far poses were moved [m] and turned [rad], at most; `strain` [chi^2]
+    # that is left of odometry where it fits worst, and `strained`, the picture before that
 
 
-def straighten(drives: DriveSet, robot: RobotSpec, pictures: np.ndarray | None = None
-               ) -> Straightened:
+def straighten(drives: DriveSet, robot: RobotSpec, pictures: np.ndarray | None = None, *,
+               stretch: np.ndarray | None = None,
+               show: Callable[[float], None] = lambda share: None,
+               until: float = math.inf) -> Straightened:
     """Correct the poses of a drive by the places that it shows twice.
 
     Args:
@@ -76,37 +85,55 @@ def straighten(drives: DriveSet, robot: RobotSpec, pictures: np.ndarray | None =
             there.
         robot: its camera.
         pictures: [N,3,S,S] uint8; default: those of the drives. 128 to 160 pixels are enough.
+        stretch: [N] int64, 0 and up: between two of them odometry does not hold
+            (`continuity.divide`); default: it holds throughout.
+        show: is told the share that is done.
+        until: `time.monotonic()` after which no further round of the search begins, unless
+            there are several stretches.
 
     Returns:
         The poses; as odometry has them where too little was recognised (`facts['corrected']`).
     """
-    drive = _Drive(drives, robot, drives.image if pictures is None else pictures)
+    drive = _Drive(drives, robot, drives.image if pictures is None else pictures, stretch,
+                   lambda share: show(LOOKING * share))
     found = _Found(drive)
     solution = solve(drive.odometry[drive.node], drive.edges, found.edges())
+    rounds = 0
     for loosen in ROUNDS:
-        if found.search(solution, loosen):
+        if rounds and time.monotonic() > until and not drive.stretch.any():
+            break
+        done = LOOKING + (1 - LOOKING) * rounds / len(ROUNDS)
+        if found.search(solution, loosen, lambda share, done=done: show(
+                done + share * (1 - LOOKING) / len(ROUNDS))):
             solution = found.settle(solution)
+        rounds += 1
     facts = {'pictures': len(drive.odometry), 'keyframes': len(drive.key),
              'compared': len(found.tested), 'recognised': len(found.closures),
-             'closures': int(found.kept.sum()), 'corrected': bool(found.kept.sum() >= FEWEST)}
+             'closures': int(found.kept.sum()), 'corrected': bool(found.kept.sum() >= FEWEST),
+             'rounds': rounds, 'strain': 0.0}
+    own, place = found.places()
     if not facts['corrected']:
-        return Straightened(drive.odometry.copy(), np.zeros(0, CLOSURE), facts)
+        return Straightened(drive.odometry.copy(), np.zeros(0, CLOSURE), own, place, facts)
     poses = drive.spread(solution.poses)
     off = between(drive.odometry, poses)
+    strain = misfit(solution.poses, drive.edges, solution.shares)
     facts |= {'moved': float(np.hypot(off[:, 0], off[:, 1]).max()),
-              'turned': float(np.abs(off[:, 2]).max())}
-    return Straightened(poses, found.table(solution), facts)
+              'turned': float(np.abs(off[:, 2]).max()), 'strain': float(strain.max(initial=0.0)),
+              'strained': int(drive.node[np.argmax(strain)]) if len(strain) else 0}
+    return Straightened(poses, found.table(solution), own, place, facts)
 
 
 class _Drive:
     """Odometry, keyframes and nodes of a drive."""
 
-    def __init__(self, drives: DriveSet, robot: RobotSpec, pictures: np.ndarray):
+    def __init__(self, drives: DriveSet, robot: RobotSpec, pictures: np.ndarray,
+                 stretch: np.ndarray | None, show: Callable[[float], None]):
         self.odometry = np.array(drives.pose, np.float64)
         steps = between(self.odometry[:-1], self.odometry[1:])
         ways = np.hypot(steps[:, 0], steps[:, 1])
+        self.stretch = (np.zeros(len(self.odometry), np.int64) if stretch is None else stretch)
         carried = (np.diff(drives.episode) != 0) & (
-            (np.abs(np.diff(drives.time)) > GAP) | (ways > JUMP))
+            (np.abs(np.diff(drives.time)) > GAP) | (ways > JUMP)) | (np.diff(self.stretch) != 0)
         self.way, self.turn, self.net = (  # m driven, rad turned, rad to the left, [N]
             np.append(0.0, np.cumsum(np.where(carried, 0.0, moved)))
             for moved in (ways, np.abs(steps[:, 2]), steps[:, 2]))
@@ -118,7 +145,10 @@ class _Drive:
         self.near = np.minimum(before + (shares > 0.5), len(self.node) - 1)  # node of a keyframe
         self.offset = between(self.odometry[self.node[self.near]], self.odometry[self.key])
         self.camera = Camera(robot, pictures.shape[-1])
-        self.features = [self.camera.look(pictures[k], _depth(drives, k)) for k in self.key]
+        self.features = []
+        for count, k in enumerate(self.key):
+            show(count / len(self.key))
+            self.features.append(self.camera.look(pictures[k], _depth(drives, k)))
 
     def spread(self, nodes: np.ndarray) -> np.ndarray:
         """Poses [N,3] of all pictures from those of the nodes [A,3].
@@ -179,6 +209,7 @@ class _Found:
     def __init__(self, drive: _Drive):
         self._drive = drive
         self.tested: set[tuple[int, int]] = set()
+        self._alike: list[tuple[int, int, bool]] = []  # tight pairs, and whether recognised
         self.closures: list[_Closure] = []
         self.kept = np.zeros(0, bool)
 
@@ -197,14 +228,30 @@ class _Found:
         out['chi'] = solution.chi
         return out
 
-    def search(self, solution: Solution, loosen: float) -> int:
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """`stretch` and `place` of `Straightened`."""
+        drive, stretch = self._drive, self._drive.stretch.copy()
+        first, second, recognised = np.array(self._alike, np.int64).reshape(-1, 3).T
+        own = stretch[drive.key[first]] == stretch[drive.key[second]]
+        cut = unnoticed(first[own], second[own], recognised[own].astype(bool))
+        if cut is not None:
+            at = drive.key[cut]
+            stretch[at:] += stretch[at] == stretch[at - 1]
+        ends = drive.key[self._ends()[:, self.kept]] if self.kept.any() else np.zeros((2, 0), int)
+        return stretch, together(int(stretch.max()) + 1, stretch[ends].T, FEWEST)
+
+    def search(self, solution: Solution, loosen: float, show: Callable[[float], None]) -> int:
         """Compare the most promising keyframes; how many were recognised where they may be."""
         poses = self._drive.spread(solution.poses)[self._drive.key]
         covariance = solution.covariance()
         fresh = []
         for pair, *doubt in self._candidates(poses, covariance, loosen):
+            show(pair[1] / len(poses))
             self.tested.add(pair)
-            closure = self._compare(*pair, between(poses[pair[0]], poses[pair[1]]), *doubt)
+            expected = between(poses[pair[0]], poses[pair[1]])
+            closure = self._compare(*pair, expected, *doubt)
+            if self._tight(pair, expected, *doubt):
+                self._alike.append((*pair, closure is not None))
             if closure is not None:
                 fresh.append(closure)
         if fresh:
@@ -277,6 +324,13 @@ class _Found:
                      if (int(past[k]), i) not in self.tested]
             for k in order[:EACH]:
                 yield (int(past[k]), i), float(off[k]), float(twist[k])
+
+    def _tight(self, pair: tuple[int, int], expected: np.ndarray, place: float, heading: float
+               ) -> bool:
+        """Whether two pictures must look alike, see `same_place.unnoticed`."""
+        return (math.hypot(*expected[:2]) + place < TIGHT[0]
+                and abs(expected[2]) + heading < TIGHT[1]
+                and min(len(self._drive.features[k].slope) for k in pair) >= PLAIN)
 
     def _compare(self, first: int, second: int, expected: np.ndarray, place: float,
                  heading: float) -> _Closure | None:

@@ -97,6 +97,11 @@ def solve(poses: np.ndarray, odometry: Edges, closures: Edges, scale: float = 0.
     return Solution(poses, shares, chi, information)
 
 
+def misfit(poses: np.ndarray, odometry: Edges, shares: np.ndarray) -> np.ndarray:
+    """Chi^2 [E] that poses leave of odometry: what they contradict is far above `GATE`."""
+    return _errors(poses, odometry, ODOMETRY @ shares)[1]
+
+
 def relative(solution: Solution, covariance: np.ndarray, edges: Edges
              ) -> tuple[np.ndarray, np.ndarray]:
     """How measurements differ from what is known: errors [E,3], covariances [E,3,3] of that.

@@ -23,8 +23,8 @@ HOUSES_AT_ONCE = 16  # in memory
 ENVIRONMENTS = 50  # at most at once, unless there are more houses
 
 
-def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpec
-                 ) -> list[Episode]:
+def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpec,
+                 show: Callable[[float], None] = lambda share: None) -> list[Episode]:
     """Run a fixed number of episodes in each environment (early finishers would flatter).
 
     Args:
@@ -33,6 +33,8 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
         episodes: at least this many; rounded up to the same number in each environment.
         seed: of the environment: equal seeds give equal starts.
         robot: for the duration of actions at its default limits.
+        show: is told the share of the episodes that is over before every step, and may raise
+            there.
 
     Returns:
         Environment by environment, each in the order of time.
@@ -49,6 +51,7 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
     paths = [[pose[:3]] for pose in info['pose']]
     contacts: list[list[np.ndarray]] = [[] for _ in range(count)]
     while any(len(own) < each for own in found):
+        show(sum(min(len(own), each) for own in found) / (each * count))
         actions = actor(observation, info['reset'])
         observation, rewards, terminated, truncated, info = env.step(actions)
         acting = ~info['reset']
@@ -159,7 +162,7 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
         environments = len(part) * -(-each // rounds)
         for stop in (ARRIVAL, DECLARED):
             env = make_env(part, environments, stop)
-            actors = _actors(env, network, decoding, controls, threshold, seed + chunk, known)
+            actors = make_actors(env, network, decoding, controls, threshold, seed + chunk, known)
             for name, (actor, shown) in actors.items():
                 env.set_shown_goal(shown)
                 rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
@@ -169,8 +172,8 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
     return rows
 
 
-def _actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
-            seed: int, known: Sequence[int]) -> dict[str, tuple[Actor, str]]:
+def make_actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
+                seed: int, known: Sequence[int] = ()) -> dict[str, tuple[Actor, str]]:
     """Who drives in each row, and which goal picture it is shown; the policy itself first."""
     def policy(rule: str = decoding) -> Actor:
         return PolicyActor(env, network, rule, seed, threshold, known)

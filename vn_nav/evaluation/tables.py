@@ -65,6 +65,12 @@ def _scenes_cells(scenes: dict, stop: str) -> tuple[list[str], list[list[str]]]:
     return ['house', 'episodes', *(heading for heading, _ in columns), *names[1:]], lines
 
 
+def row_line(name: str, figures: dict, stop: str) -> str:
+    """A row in a line, as soon as it is measured."""
+    words = [f'{heading} {shown(figures)}' for heading, shown in _columns(stop)]
+    return f'{name}: {figures["episodes"]} episodes, {", ".join(words)}'
+
+
 def print_rows(figures: dict[str, dict[str, dict]], title: str) -> None:
     """Print the rows of a split, a table for each kind of stop.
 

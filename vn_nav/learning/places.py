@@ -21,7 +21,7 @@ BATCH = 128  # pictures
 LEARNING_RATE = 1e-3  # of Adam, at the start; falls to a twentieth
 NEAR, TURNED = 0.35, np.radians(20)  # m, rad: a spot and a heading stand for poses about so near
 JUDGED, JUDGED_GOALS = 1024, 32  # pictures
-BANK, ROUTE_BATCH = 8192, 1024  # pictures that ways begin at; ways in a step
+BANK, ROUTE_BATCH = 8192, 1024  # pictures that ways begin at, at most; ways in a step
 SEED = 1  # of the spots
 
 
@@ -42,7 +42,8 @@ def spread_spots(positions: np.ndarray, count: int) -> np.ndarray:
 
 
 def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarray, *,
-               minutes: float, say: Callable[[str], None], least: int = 0) -> dict[str, float]:
+               minutes: float, say: Callable[[str], None], least: int = 0,
+               show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
     """Fit the recogniser of a network to a place.
 
     Cross-entropy with the spots and headings about the true pose (Banino et al. 2018).
@@ -55,6 +56,7 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
         minutes: wall-clock time.
         say: is told how it goes, a few times.
         least: pictures to learn from, however long that takes.
+        show: is told the share that is over before every step, and may raise there.
 
     Returns:
         Medians on the other pictures: `metres` and `degrees` off, and `pictures` learned from.
@@ -69,6 +71,7 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
     begun, seen, told = time.monotonic(), 0, 0
     try:
         while (share := _share((time.monotonic() - begun) / (60 * minutes), seen, least)) < 1:
+            show(share)
             for group in optimiser.param_groups:
                 group['lr'] = LEARNING_RATE * (1 - 0.95 * share)
             pictures, poses = source.draw(BATCH)
@@ -90,8 +93,8 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
 
 
 def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets: np.ndarray, *,
-               until: float, say: Callable[[str], None], seed: int = 0, least: int = 1
-               ) -> dict[str, float]:
+               until: float, say: Callable[[str], None], seed: int = 0, least: int = 1,
+               show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
     """Teach `Routes` the shortest ways, by what the recogniser says of pictures.
 
     Cross-entropy with `softened` choices. Each picture is recognised once, and a hundred thousand
@@ -104,6 +107,7 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
         until: `time.monotonic()` at which to end.
         say: is told how it went.
         least: ways to learn from, however long that takes.
+        show: is told the share that is over before every step, and may raise there.
 
     Returns:
         `regret`: decisions that the most advised first action loses on average; `ways`: how many
@@ -116,6 +120,7 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
     begun, seen = time.monotonic(), 0
     limit = max(until - begun, 1e-9)
     while (share := _share((time.monotonic() - begun) / limit, seen, least)) < 1:
+        show(share)
         for group in optimiser.param_groups:
             group['lr'] = LEARNING_RATE * (1 - 0.95 * share)
         goal, row = (torch.randint(size, (ROUTE_BATCH,), generator=generator)

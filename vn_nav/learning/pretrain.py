@@ -39,9 +39,11 @@ STATE, CHECKPOINT = 'pretrain_state', 'checkpoint'
 # frames, minutes, tau and success are what `vn_nav compare` asks for; no episode is driven here.
 COLUMNS = ('frames', 'minutes', 'tau', 'success', 'epoch',
            *(f'{where}{name}' for where in ('', 'validation_')
-             for name in ('loss', *(f'{part}_loss' for part in PARTS), *FIGURES)))
+             for name in ('loss', *(f'{part}_loss' for part in PARTS), *FIGURES)),
+           *(f'baseline_{name}' for name in FIGURES))
 JUDGED = 1024  # pairs, and steps of windows, of a validation at most
 AT_A_TIME = 64  # pairs of a validation
+GUESSED = 1_000_003  # of the random numbers by which pairs are drawn for the baseline
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,6 +182,10 @@ class _Pretraining:
         self.metrics: list[dict] = []  # a row an epoch, before the first one too
         self.best: dict = {'loss': math.inf, 'epoch': 0, 'weights': None}
         self.tally = Tally()  # of the present epoch
+        rng = np.random.default_rng((config.seed, GUESSED))
+        some = np.sort(rng.permutation(len(self.rows))[:JUDGED])
+        self.guess = self.objective.guess(self.rows[some], partners(told.train, rng)[some],
+                                          drives.action[self.rows])
 
     def run(self, resume: bool, on_epoch) -> Path:
         self._begin(resume)
@@ -242,8 +248,11 @@ class _Pretraining:
         self.optimiser.step()
 
     @torch.no_grad()
-    def _judge(self) -> dict[str, float]:
-        """Figures on the validation's episodes: the same pairs and windows every time."""
+    def _judge(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Figures on the validation's episodes: the same pairs and windows every time.
+
+        And those of the best guess on the same ones.
+        """
         config, spans = self.config, self.told.validation
         rng = np.random.default_rng(config.seed)
         rows, goals = rows_of(spans), partners(spans, rng)
@@ -259,15 +268,16 @@ class _Pretraining:
             for first in range(0, len(windows), max(AT_A_TIME // config.window, 1)):
                 part = windows[first:first + max(AT_A_TIME // config.window, 1)]
                 self.objective.losses(Batch(None, None, part), tally)
-        return tally.figures(config.weight)
+        return tally.figures(config.weight), tally.baseline(self.guess)
 
     def _report(self, on_epoch) -> None:
         """End an epoch: judge, write the curves, keep the best weights."""
-        judged = self._judge()
+        judged, guessed = self._judge()
         row = dict.fromkeys(COLUMNS, math.nan) | {
             'frames': self.epoch * len(self.rows), 'minutes': self.seconds / 60, 'tau': 1.0,
             'epoch': self.epoch, **self.tally.figures(self.config.weight),
-            **{f'validation_{name}': value for name, value in judged.items()}}
+            **{f'validation_{name}': value for name, value in judged.items()},
+            **{f'baseline_{name}': value for name, value in guessed.items()}}
         self.metrics.append(row)
         self.tally = Tally()
         if self.epoch and judged['loss'] < self.best['loss']:
@@ -295,11 +305,14 @@ class _Pretraining:
         network = Policy(self.network.config)
         network.load_state_dict(self.best['weights'])
         row = self.metrics[self.best['epoch']]
-        figures = {name.removeprefix('validation_'): value for name, value in row.items()
-                   if name.startswith('validation_') and math.isfinite(value)}
+        judged, guessed = ({name.removeprefix(kind): value for name, value in row.items()
+                            if name.startswith(kind) and math.isfinite(value)}
+                           for kind in ('validation_', 'baseline_'))
         save_checkpoint(self.folder / CHECKPOINT, network, {
             **self.info, 'minutes': round(self.seconds / 60, 2), 'seed': self.config.seed,
-            'results': {'pre-training, validation steps': figures},
+            'losses': list(self.objective.parts),
+            'results': {'pre-training, validation steps': judged,
+                        'the same steps, a guess without pictures': guessed},
             'notes': f'Weights of epoch {self.best["epoch"]} of {self.config.epochs}, the best on '
                      f'the validation. {self.info.get("notes", "")}'.strip()})
 

@@ -18,7 +18,7 @@ from vn_nav.bags.recorded_place import scene_of
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.errors import UserError
 from vn_nav.learning.command import CHANGES, train_config
-from vn_nav.learning.hindsight import Drives, split
+from vn_nav.learning.hindsight import Drives, Split, rows_of, split
 from vn_nav.learning.presets import PRESETS, TrainConfig
 from vn_nav.learning.pretrain import PretrainConfig, choose_parts, pretrain
 from vn_nav.learning.supervised import PARTS
@@ -96,12 +96,40 @@ def run_pretrain(args: argparse.Namespace) -> int:
         'camera_fov_deg': math.degrees(robot.camera_fov), 'camera_height': robot.camera_height,
         'preset': train.preset,
         'command': 'vn_nav ' + shlex.join(word for word in sys.argv[1:] if word != '--resume'),
+        'data': _data(args.bags, drives, told, args.init),
         'notes': f'Pre-trained on {len(drives):,} steps of {len(args.bags)} bag'
                  f'{"s" * (len(args.bags) > 1)}: {", ".join(parts).replace("_", " ")}; '
-                 f'{told.words}.'}
+                 f'{told.words}. Losses and figures are of these recorded steps, not of driving; '
+                 'a guess without pictures says the most frequent action and the mean pose of the '
+                 'steps that were learned from.'}
+    for line in _legend(parts):
+        print(line, flush=True)
     print(pretrain(policy, drives, parts, told, args.out, numbers, info=info, resume=args.resume,
                    on_epoch=_print_row))
     return 0
+
+
+def _data(bags: Sequence[Path], drives: Drives, told: Split, init: Path | None) -> str:
+    """Where the pictures came from, and how many."""
+    held = sum(part.facts['pictures'] for part in drives.sets)
+    begun = f'; begun with the weights of {init}' if init else ''
+    return (f'{held:,} recorded pictures of {", ".join(bag.name for bag in bags)}: '
+            f'{len(rows_of(told.train)):,} steps to learn from, {len(rows_of(told.validation)):,} '
+            f'others to judge by{begun}')
+
+
+def _legend(parts: Sequence[str]) -> list[str]:
+    """What the columns of an epoch mean, those that there are."""
+    lines = ['a line an epoch, 0 is before learning: figures while learning (on the validation; '
+             'of a guess without pictures)',
+             '  loss: the weighted sum of the losses behind it; less is better']
+    if 'cloning' in parts:
+        lines.append('  right actions: share of the steps where the likeliest action is the one '
+                     'that was driven; the guess: always the most frequent one')
+    if 'goal_pose' in parts:
+        lines.append('  bearing off by deg: median error of the direction to the goal, of pairs '
+                     'that show the same; the guess: the mean pose')
+    return lines
 
 
 def load_bags(bags: Sequence[Path], robot: RobotSpec, size: int, topics: Topics, cache: Path
@@ -185,10 +213,15 @@ def _describe(bag: Path, drives: DriveSet, wanted: Wanted) -> str:
 
 
 def _print_row(row: dict) -> None:
-    """An epoch in a line: what was learned, in training and (in brackets) on the validation."""
+    """An epoch in a line: what was learned, in training and (in brackets) on the validation.
+
+    Behind the validation's figure that of a guess, where there is one; see `_legend`.
+    """
     def both(name: str, form: str) -> str:
         own = '' if math.isnan(row[name]) else format(row[name], form) + ' '  # before it learns
-        return f'{own}({format(row[f"validation_{name}"], form)})'
+        guess = row.get(f'baseline_{name}', math.nan)
+        guess = '' if math.isnan(guess) else f'; {guess:{form}}'
+        return f'{own}({format(row[f"validation_{name}"], form)}{guess})'
     words = [f'epoch {row["epoch"]} · {row["minutes"]:.1f} min', f'loss {both("loss", ".3f")}']
     words += [f'{part.replace("_", " ")} {both(f"{part}_loss", ".3f")}' for part in PARTS
               if not math.isnan(row[f'validation_{part}_loss'])]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vn_nav.learning import pairs
-from vn_nav.learning.auxiliary import FAR, image_target, pose_loss
+from vn_nav.learning.auxiliary import FAR, POSE_OVERLAP, image_target, pose_loss
 from vn_nav.learning.hindsight import Drives, Windows, fill_windows
 from vn_nav.learning.pixel_change import average_pool_target
 from vn_nav.learning.returns import masked_mean
@@ -26,6 +26,14 @@ BY_WINDOW = ('cloning', 'arrival', 'distance')  # what needs a memory, and so wi
 PARTS = (*IMAGE_HEADS, 'goal_pose', *BY_WINDOW)
 FIGURES = ('action_accuracy', 'bearing_deg', 'bearing_within_30', 'heading_deg', 'distance_m',
            'overlap_accuracy')
+
+
+class Guess(NamedTuple):
+    """What is best said without a look at any picture: the figures' baseline."""
+
+    action: int | None  # the most frequent one; None: there is none
+    goal_pose: np.ndarray  # [4] the mean of pairs that overlap
+    overlap: bool  # whether most pairs do
 
 
 class Batch(NamedTuple):
@@ -42,6 +50,7 @@ class Tally:
     def __init__(self):
         self._sums: dict[str, list] = {}  # by part: loss times count, count
         self._right = 0  # actions
+        self._acted: list[int] = []  # how often each was driven
         self._poses: list[Tensor] = []  # [K,10]: x, y, cos, sin, logit as said; the pose, overlap
 
     def add(self, part: str, loss: Tensor, count: int) -> None:
@@ -50,9 +59,12 @@ class Tally:
         total[0] += float(loss.detach()) * count
         total[1] += count
 
-    def add_actions(self, right: Tensor) -> None:
-        """Count the actions [K] that would have been chosen."""
+    def add_actions(self, right: Tensor, action: Tensor) -> None:
+        """Count the actions [K] that were driven, and which [K] of them would have been chosen."""
         self._right += int(right.sum())
+        counts = torch.bincount(action.cpu(), minlength=len(self._acted)).tolist()
+        before = self._acted + [0] * (len(counts) - len(self._acted))
+        self._acted = [a + b for a, b in zip(before, counts, strict=True)]
 
     def add_poses(self, said: Pose, goal_pose: Tensor, overlap: Tensor) -> None:
         """Keep K poses and their labels."""
@@ -74,14 +86,30 @@ class Tally:
                 'goal_pose': table[:, 5:9].numpy(), 'overlap': table[:, 9].numpy()})
         return row
 
+    def baseline(self, guess: Guess) -> dict[str, float]:
+        """`FIGURES` of a guess, on the same steps and pairs."""
+        row = {}
+        if sum(self._acted) and guess.action is not None:
+            own = self._acted[guess.action] if guess.action < len(self._acted) else 0
+            row['action_accuracy'] = own / sum(self._acted)
+        if self._poses:
+            table = torch.cat(self._poses)
+            table = table[table[:, 9] >= 0]
+            said = torch.from_numpy(guess.goal_pose).float().expand(len(table), 4)
+            sign = torch.full((len(table),), 1.0 if guess.overlap else -1.0)
+            row |= pairs.errors(Pose(said[:, :2], said[:, 2:], sign), {
+                'goal_pose': table[:, 5:9].numpy(), 'overlap': table[:, 9].numpy()})
+        return row
+
     def state_dict(self) -> dict:
         """Plain values and tensors."""
-        return {'sums': self._sums, 'right': self._right,
+        return {'sums': self._sums, 'right': self._right, 'acted': self._acted,
                 'poses': torch.cat(self._poses) if self._poses else None}
 
     def load_state_dict(self, state: dict) -> None:
         """Go on where `state_dict` was taken."""
         self._sums, self._right = state['sums'], state['right']
+        self._acted = state.get('acted', [])
         self._poses = [] if state['poses'] is None else [state['poses']]
 
 
@@ -124,6 +152,15 @@ class Objective:
         if 'goal_pose' in self.parts and poses:
             losses['goal_pose'] = self._pose_loss(poses, tally)
         return losses
+
+    def guess(self, rows: np.ndarray, goals: np.ndarray, action: np.ndarray) -> Guess:
+        """The best guess by pairs [K] and by actions [M] to learn from, negative where none is."""
+        poses, shown = self.drives.label(rows, goals).goal_pose, self.drives.overlap(rows, goals)
+        sees, known = shown >= POSE_OVERLAP, shown >= 0
+        mean = poses[sees if sees.any() else slice(None)].mean(axis=0)
+        counts = np.bincount(action[action >= 0])
+        return Guess(int(counts.argmax()) if len(counts) else None, mean,
+                     bool(sees[known].mean() > 0.5) if known.any() else False)
 
     def _look_once(self, rows: np.ndarray, goals: np.ndarray) -> Latents:
         """Latents of pictures [K] towards goals [K], each by itself."""
@@ -173,7 +210,7 @@ class Objective:
             losses['cloning'] = masked_mean(
                 F.cross_entropy(logits, action, reduction='none'), acts)
             tally.add('cloning', losses['cloning'], int(acts.sum()))
-            tally.add_actions((logits.argmax(1) == action) & acts)
+            tally.add_actions((logits.argmax(1) == action)[acts], action[acts])
         labels = self.drives.label(rows, goals)
         if 'arrival' in self.parts:
             losses['arrival'] = F.binary_cross_entropy_with_logits(

@@ -14,10 +14,12 @@ from rclpy.duration import Duration
 
 from vn_msgs_py import motion
 from vn_nav.nodes.qos import qos
-from vn_nav.policy.navigator import Navigator, State
+from vn_nav.policy.clock_watch import ClockWatch
+from vn_nav.policy.navigator import Navigator
 
 CROSSING = 0.03  # s of wall time, see _lock_step
-AT_ONCE = (State.STOPPED, State.ARRIVED)  # their zero does not wait for the next period
+JUMP_M = 0.5  # odometry that moves by this, and more than the robot could have, was set anew
+REORDERED_S = 1.0  # odometry from longer ago is from another time
 
 
 class CommandOutput:
@@ -27,7 +29,6 @@ class CommandOutput:
         node: that publishes `cmd_vel`.
         navigator: says the velocity.
         wake: guards the navigator and what this object keeps.
-        is_running: false ends `run`.
         period: between two commands [s].
         lock_step: one command for every odometry message instead.
         stamped: TwistStamped instead of Twist.
@@ -40,11 +41,12 @@ class CommandOutput:
         odometry: [3] x, y [m], yaw [rad] of the newest message; None before the first.
     """
 
-    def __init__(self, node, navigator: Navigator, wake: threading.Condition,
-                 is_running: Callable[[], bool], *, period: float, lock_step: bool,
-                 stamped: bool, name: str = 'cmd_vel', patience: float | None = 0.5):
+    def __init__(self, node, navigator: Navigator, wake: threading.Condition, *, period: float,
+                 lock_step: bool, stamped: bool, name: str = 'cmd_vel',
+                 patience: float | None = 0.5):
         self._node, self._navigator, self._wake = node, navigator, wake
-        self._is_running, self._period, self._in_lock_step = is_running, period, lock_step
+        self._period, self._in_lock_step = period, lock_step
+        self._is_running: Callable[[], bool] = lambda: False
         self._stamped, self._patience = stamped, patience
         self.publisher = node.create_publisher(TwistStamped if stamped else Twist, name, qos(name))
         self.odometry: np.ndarray | None = None
@@ -53,55 +55,104 @@ class CommandOutput:
         self._received = -math.inf
         self._count = 0
         self._robot_moves = False  # by the last command sent
+        self._clock_watch = ClockWatch()
 
     @property
     def silence(self) -> float:
         """Seconds since the newest odometry that was usable."""
         return time.monotonic() - self._received
 
+    @property
+    def odometry_lost(self) -> bool:
+        """There was odometry, and it fell silent."""
+        return self.odometry is not None and (
+            self.silence > self._navigator.limits.odometry_timeout)
+
     def take_odometry(self, message: Odometry) -> None:
-        """Keep the newest odometry; stop on numbers that are not finite."""
+        """Keep the newest odometry; stop on numbers that no odometry has."""
         with self._wake:
             try:
                 values = motion.odometry_to_array(message)
             except motion.MotionError as error:
                 self._navigator.stop(f'bad odometry: {error}', time.monotonic())
+                self._wake.notify_all()
                 return
-            if self._in_lock_step and values[6] < self._stamp:
-                self._navigator.time_jumped()
+            now = time.monotonic()
+            back = self._stamp - values[6] if self.odometry is not None else 0.0
+            if self._in_lock_step and back > 0.0:
+                self._navigator.time_jumped(f'odometry stamps went back by {back:.4g} s')
+            elif 0.0 < back < REORDERED_S:
+                return
+            elif not self._in_lock_step and (jump := self._jump(values, now)) > 0.0:
+                self._navigator.odometry_jumped(f'odometry jumped by {jump:.4g} m')
             self.odometry, self._stamp = values[:3], values[6]
             self._rests = not values[3:6].any()
-            self._received = time.monotonic()
+            self._received = now
             self._count += 1
             self._wake.notify_all()
 
-    def run(self) -> None:
-        """Publish commands until the node does not run any more."""
+    def _jump(self, values: np.ndarray, now: float) -> float:
+        """Metres of a step in the pose that no driving explains; 0: there is none."""
+        if self.odometry is None:
+            return 0.0
+        step = math.hypot(*(values[:2] - self.odometry[:2]))
+        drivable = 3.0 * self._navigator.robot.max_linear * (now - self._received)
+        return step if step > JUMP_M + drivable else 0.0
+
+    def run(self, is_running: Callable[[], bool]) -> None:
+        """Publish commands until `is_running` says that the node does not any more."""
+        self._is_running = is_running
+        self._robot_moves = False
         if self._in_lock_step:
             self._lock_step()
         else:
             self._real_time()
 
     def _real_time(self) -> None:
-        due = time.monotonic()
+        due = last = time.monotonic()
         while True:
             due = max(due + self._period, time.monotonic())
             with self._wake:
-                self._wake.wait_for(
-                    lambda: not self._is_running() or (self._navigator.state in AT_ONCE
-                                                       and self._robot_moves),
-                    timeout=max(0.0, due - time.monotonic()))
+                self._wait(due)
                 if not self._is_running():
                     return
                 now = time.monotonic()
-                lost = self.odometry is not None and (
-                    now - self._received > self._navigator.limits.frame_timeout)
+                due = min(due, now)  # woken early: the next period begins here
                 stamp = self._node.get_clock().now().nanoseconds * 1e-9
-                velocity = self._navigator.step(now, self._period, self.odometry, stamp,
-                                                odometry_lost=lost)
+                if jumped := self._clock_watch.look(stamp, now):
+                    self._navigator.time_jumped(jumped)
+                # An action's profile is made for whole periods; a velocity that is held follows
+                # its decisions whenever they come.
+                passed = min(self._period, now - last) if self._navigator.continuous else (
+                    self._period)
+                velocity = self._navigator.step(now, passed, self.odometry, stamp,
+                                                odometry_lost=self.odometry_lost)
                 self._robot_moves = velocity is not None and bool(velocity.any())
+                last = now
             if velocity is not None:
                 self.send(velocity)
+
+    def _wait(self, due: float) -> None:
+        """Until the next period, or for what does not wait for it.
+
+        That is a zero where the last command moved the robot, a decision, and the moment at which
+        the watchdog has to look.
+        """
+        while self._is_running():
+            if self._navigator.ready_to_move or (
+                    self._robot_moves and not self._navigator.velocity.any()):
+                return
+            until = min(due, self._deadline()) if self._robot_moves else due
+            # A wait may end a moment early, and "later than" wants to be true.
+            remaining = until + 0.001 - time.monotonic()
+            if remaining <= 0.0:
+                return
+            self._wake.wait(remaining)
+
+    def _deadline(self) -> float:
+        odometry = math.inf if self.odometry is None else (
+            self._received + self._navigator.limits.odometry_timeout)
+        return min(self._navigator.deadline(), odometry)
 
     def _lock_step(self) -> None:
         """One command for every odometry message; the first of a motion goes out at once.
@@ -145,6 +196,10 @@ class CommandOutput:
         self.publisher.publish(motion.fill_twist(message, velocity))
 
     def deliver_zero(self) -> None:
-        """A last zero that has been delivered when this returns (200 ms at most)."""
-        self.send(np.zeros(4))
+        """A last zero that has been delivered when this returns (200 ms at most).
+
+        Said three times: a listener that is best effort acknowledges nothing.
+        """
+        for _ in range(3):
+            self.send(np.zeros(4))
         self.publisher.wait_for_all_acked(Duration(seconds=0.2))

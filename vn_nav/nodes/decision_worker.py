@@ -13,11 +13,14 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Int8, String
 
 from vn_msgs_py import images
-from vn_nav.errors import UserError
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.window import Window
 from vn_nav.observation import crop_fraction, needed_side, preprocess
+from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
+
+WINDOW_S = 5.0  # of which rates and latencies are told
 
 
 class DecisionWorker:
@@ -28,26 +31,28 @@ class DecisionWorker:
         navigator: wants the decisions.
         runtime: makes them; only the thread in `run` uses it.
         wake: guards the navigator and what this object keeps.
-        is_running: false ends `run`.
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
         shadow: decide only where `tell` says so, for a robot that somebody else drives.
 
     Attributes:
         camera_fov: field of view of the camera [rad], as far as it is known.
+        inferences: seconds that the decisions of the last while took.
         publishers: what `create_publisher` made.
     """
 
     def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
-                 wake: threading.Condition, is_running: Callable[[], bool], *, lock_step: bool,
-                 shadow: bool = False):
+                 wake: threading.Condition, *, lock_step: bool, shadow: bool = False):
         self._node, self._navigator, self._runtime = node, navigator, runtime
-        self._wake, self._is_running, self._lock_step = wake, is_running, lock_step
+        self._wake, self._lock_step = wake, lock_step
         self._shadow = shadow
         self._told: tuple[float, int] | None = None  # what `tell` was told
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
         self.camera_fov: float | None = None
-        self._frame: tuple | None = None  # the newest message and its stamp
-        self._goal: Image | None = None
+        self._frame: tuple | None = None  # the newest message, its stamp, when it came
+        self._goal: Image | None = None  # to be taken
+        self._goal_in_force: Image | None = None
+        self._epoch = navigator.epoch
+        self.inferences = Window(WINDOW_S)
         self._said: bool | None = None  # on `arrived`
         self._action, names, self._arrived = self.publishers = [
             node.create_publisher(kind, name, qos(name)) for kind, name in (
@@ -55,10 +60,16 @@ class DecisionWorker:
         names.publish(String(data=json.dumps(list(runtime.action_names))))
         self.tell_arrival()
 
-    def show_frame(self, message, stamp: float) -> None:
-        """The newest admitted picture; one before it that still waits is dropped."""
+    def show_frame(self, message, stamp: float, received: float) -> None:
+        """The newest admitted picture; one before it that still waits is dropped.
+
+        Args:
+            message: the picture.
+            stamp: its [s].
+            received: steady time at which it came [s].
+        """
         with self._wake:
-            self._frame = self._shown = (message, stamp)
+            self._frame = self._shown = (message, stamp, received)
             self._wake.notify_all()
 
     def show_goal(self, message: Image) -> None:
@@ -84,6 +95,18 @@ class DecisionWorker:
                 self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
 
+    def set_camera_fov(self, fov: float) -> None:
+        """What the camera says of itself [rad]. The goal was cropped for what it said before."""
+        with self._wake:
+            known = self.camera_fov is not None and math.isclose(fov, self.camera_fov,
+                                                                 rel_tol=1e-3)
+            if known:
+                return
+            self.camera_fov = fov
+            if self._goal is None and self._goal_in_force is not None:
+                self._goal = self._goal_in_force
+                self._wake.notify_all()
+
     def check_fov(self) -> None:
         """Raise UserError where the camera sees less than the policy needs."""
         if self.camera_fov is not None:
@@ -101,12 +124,12 @@ class DecisionWorker:
                 self._said = arrived
                 self._arrived.publish(Bool(data=arrived))
 
-    def run(self) -> None:
-        """Decode every admitted frame, until the node does not run any more."""
+    def run(self, is_running: Callable[[], bool]) -> None:
+        """Decode every admitted frame, until `is_running` says that the node does not any more."""
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: not self._is_running() or self._frame or self._goal)
-                if not self._is_running():
+                self._wake.wait_for(lambda: not is_running() or self._frame or self._goal)
+                if not is_running():
                     return
                 goal, self._goal = self._goal, None
                 frame, self._frame = self._frame, None
@@ -116,13 +139,16 @@ class DecisionWorker:
                 self._take_frame(*frame)
 
     def _take_goal(self, message: Image) -> None:
+        with self._wake:
+            self._goal_in_force = message
         try:
             # A goal picture comes from a camera like this one; it is cropped the same way.
             picture = self._prepare(message)
-        except (images.ImageError, UserError) as error:
-            self._node.get_logger().error(f'goal_image refused: {error}')
+        except Exception as error:  # whatever is wrong with it: a picture moves no robot
+            self._node.get_logger().error(f'goal_image refused: {shorten(str(error))}')
             with self._wake:
-                self._navigator.refuse_goal()
+                self._navigator.refuse_goal(str(error))
+                self._wake.notify_all()
             return
         self._runtime.set_goal(picture)
         with self._wake:
@@ -132,16 +158,20 @@ class DecisionWorker:
                                             else -math.inf)
                 self.tell_arrival(again=True)
 
-    def _take_frame(self, message, stamp: float) -> None:
+    def _take_frame(self, message, stamp: float, received: float) -> None:
         try:
             picture = self._prepare(message)
-        except (images.ImageError, UserError) as error:
+        except Exception as error:  # whatever is wrong with it: as good as no picture
             with self._wake:
-                self._navigator.bad_frame(str(error), time.monotonic())
+                self._navigator.bad_frame(str(error) or repr(error), time.monotonic())
+                self._wake.notify_all()
             return
         with self._wake:
             now = time.monotonic()
-            self._navigator.good_frame(now)
+            self._navigator.good_frame(received)
+            if self._epoch != self._navigator.epoch:
+                self._epoch = self._navigator.epoch
+                self._runtime.reset()
             if self._shadow and (self._told is None or stamp < self._told[0]):
                 return
             ticket = self._navigator.request(stamp, now)
@@ -158,7 +188,8 @@ class DecisionWorker:
                 self._wake.notify_all()
             return
         with self._wake:
-            now = time.monotonic()
+            begun, now = now, time.monotonic()
+            self.inferences.add(now, now - begun)
             if self._runtime.arrived:
                 self._navigator.declared(ticket, self._runtime.arrival, now)
                 self.tell_arrival()

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.qos import DurabilityPolicy
 
 from vn_nav.nodes.qos import qos
+from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import State
 
+MOST_WARNINGS = 5
 LEVELS = {State.STOPPED: DiagnosticStatus.ERROR, State.HOLD: DiagnosticStatus.WARN}
 
 
@@ -28,17 +32,31 @@ class Diagnosis:
         self._last: tuple | None = None
         self._published = 0.0
 
-    def publish(self, state: State, reason: str, values: dict) -> None:
-        """Say where the node stands; the same again within a second is not said."""
-        changed = self._last != (state, reason)
+    def publish(self, state: State, reason: str, values: dict,
+                warnings: Sequence[str] = ()) -> None:
+        """Say where the node stands; the same again within a second is not said.
+
+        Args:
+            state, reason: of the navigator.
+            values: by key.
+            warnings: what is wrong though it may drive; the first is part of the message.
+        """
+        warnings = [shorten(warning) for warning in warnings[:MOST_WARNINGS]]
+        changed = self._last != (state, reason, *warnings)
         if not changed and time.monotonic() - self._published < 0.95:
             return
         if changed and state is State.STOPPED:
             self.node.get_logger().error(f'stopped: {reason}; ~/reset, then ~/enable to go on')
-        self._last, self._published = (state, reason), time.monotonic()
+        for warning in warnings:
+            if self._last is None or warning not in self._last:
+                self.node.get_logger().warning(warning, throttle_duration_sec=5.0)
+        self._last, self._published = (state, reason, *warnings), time.monotonic()
         level, words = LEVELS.get(state, DiagnosticStatus.OK), state.value
         if reason:
             words += f' ({reason})' if state is State.ARRIVED else f': {reason}'
+        if warnings:
+            level = max(level, DiagnosticStatus.WARN)
+            words += f'; {warnings[0]}'
         if mismatch := self._mismatched_listeners():
             level, words = DiagnosticStatus.ERROR, mismatch
         values = {'state': state.value, 'reason': reason,
@@ -51,11 +69,14 @@ class Diagnosis:
         self.publisher.publish(message)
 
     def _mismatched_listeners(self) -> str:
-        """Twist meets TwistStamped: the robot would stand still without a word."""
+        """Twist meets TwistStamped, or a wish for history: the robot stands still, silently."""
         mine = f'geometry_msgs/msg/{self.command.msg_type.__name__}'
         for info in self.node.get_subscriptions_info_by_topic(self.command.topic_name):
             if info.topic_type != mine:
                 other = mine == 'geometry_msgs/msg/Twist'
                 return (f'{info.node_name} listens for {info.topic_type} where this node sends '
                         f'{mine}: set enable_stamped_cmd_vel to {str(other).lower()}')
+            if info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+                return (f'{info.node_name} asks for transient local commands, which nobody keeps: '
+                        'set its durability to volatile')
         return ''

@@ -10,15 +10,17 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from vn_msgs_py.images import fill_image
 from vn_nav.errors import UserError
 from vn_nav.goal_picture import read_goal_picture
+from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.process import run_node, spin
 from vn_nav.nodes.qos import qos
+
+PARAMETERS = {'picture': ('', "JPEG or PNG, taken by the robot's camera")}
 
 
 class GoalNode(Node):
@@ -26,10 +28,11 @@ class GoalNode(Node):
 
     def __init__(self):
         super().__init__('goal_node')
-        path = Path(self.declare_parameter('picture', '', ParameterDescriptor(
-            description="JPEG or PNG, taken by the robot's camera", read_only=True)).value)
+        given = parameters.declare(self, PARAMETERS, read_only=True,
+                                   others=policy_parameters.PARAMETERS)['picture']
+        path = Path(given)
         if not path.is_file():
-            raise UserError('the goal is a picture file', str(path),
+            raise UserError('the goal is a picture file', given,
                             'give one with --ros-args -p picture:=kitchen.jpg')
         picture = read_goal_picture(path)
         self.publisher = self.create_publisher(Image, 'goal_image', qos('goal_image'))
@@ -41,7 +44,8 @@ class GoalNode(Node):
 
 def main(args=None) -> int:
     """Entry point: until a signal; exit code 2 and one line for a bad picture."""
-    return run_node('goal_node', GoalNode, spin, args)
+    return run_node('goal_node', lambda _: GoalNode(), spin, args, about=__doc__,
+                    parameters=PARAMETERS)
 
 
 if __name__ == '__main__':

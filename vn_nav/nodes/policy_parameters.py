@@ -1,26 +1,28 @@
-"""The parameters of policy_node: declared with type, meaning and range; checked when read."""
+"""The parameters of policy_node: type, meaning and limits; declared and read by name."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
-
 from vn_nav.errors import UserError
+from vn_nav.nodes import parameters
 
-# name: (default, meaning, range or None). Ranges are [least, most] in the parameter's unit.
+# name: (default, meaning, limits or None), as in `vn_nav.nodes.parameters`.
 PARAMETERS = {
     'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),
     'robot': ('', 'YAML file of the robot; empty: the standard robot', None),
     'mode': ('stop_and_go', 'stop_and_go; continuous: a decision at every frame; shadow: beside '
-                            'somebody else who drives, see docs/architecture.md', None),
-    'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step', None),
-    'image_transport': ('raw', 'raw, or compressed: image_raw/compressed', None),
+                            'somebody else who drives, see docs/architecture.md',
+             ('stop_and_go', 'continuous', 'shadow')),
+    'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step',
+             ('real_time', 'lock_step')),
+    'image_transport': ('raw', 'raw, or compressed: image_raw/compressed', ('raw', 'compressed')),
     'enable_stamped_cmd_vel': (False, 'publish TwistStamped instead of Twist', None),
     'autostart': (True, 'configure and activate at the start', None),
     'auto_enable': (False, 'enable motion as soon as it is possible (simulators only)', None),
     'seed': (0, 'of the sampled actions', None),
-    'decoding': ('', 'sample or greedy; empty: as the checkpoint was measured', None),
+    'decoding': ('', 'sample or greedy; empty: as the checkpoint was measured',
+                 ('', 'sample', 'greedy')),
     'stop_threshold': (-1.0, 'probability of arrival above which the robot stands still and says '
                              'so, 0 to 1 (1: never); -1: as the checkpoint says', (-1.0, 1.0)),
     'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
@@ -29,38 +31,34 @@ PARAMETERS = {
     'max_frame_age': (0.25, 'older frames are dropped [s]', (0.02, 5.0)),
     'max_frame_ahead': (0.05, 'frames stamped later than now are dropped [s]', (0.0, 5.0)),
     'inference_timeout': (0.1, 'later decisions are discarded [s]', (0.005, 2.0)),
+    'odometry_timeout': (0.5, 'odometry silence after which the robot stands still, and in motion '
+                              'stops [s]', (0.05, 5.0)),
+    'require_odometry': (False, 'enable motion only where odometry has come: without it actions '
+                                'run on time alone', None),
     'settle_time': (0.1, "from a motion's last command to a frame at rest [s]", (0.0, 2.0)),
 }
 
-CHOICES = {
-    'mode': ('stop_and_go', 'continuous', 'shadow'),
-    'time': ('real_time', 'lock_step'),
-    'image_transport': ('raw', 'compressed'),
-    'decoding': ('', 'sample', 'greedy'),
-}
+
+def declare(node, names: Iterable[str] = tuple(PARAMETERS), **options) -> None:
+    """Declare parameters on a node; the options are those of `parameters.declare`."""
+    parameters.declare(node, {name: PARAMETERS[name] for name in names}, **options)
 
 
-def declare(node, names: Iterable[str] = tuple(PARAMETERS)) -> None:
-    """Declare parameters on a node."""
-    for name in names:
-        default, meaning, span = PARAMETERS[name]
-        ranges = [FloatingPointRange(from_value=span[0], to_value=span[1])] if span else []
-        node.declare_parameter(name, default, ParameterDescriptor(
-            description=meaning, floating_point_range=ranges))
+def check(name: str, value: object) -> None:
+    """Raise a `UserError` for a value that a parameter cannot have."""
+    parameters.check(name, PARAMETERS, value)
+    if name == 'stop_threshold' and -1.0 < value < 0.0:
+        raise UserError('stop_threshold lies in [0, 1], or is -1', value,
+                        'set it with -p stop_threshold:=...')
 
 
 def read(node, names: Iterable[str] = tuple(PARAMETERS)) -> dict:
     """Values by name.
 
     Raises:
-        UserError: a word that is none of the choices, or a threshold that is no probability.
+        UserError: a value outside its limits, or a threshold that is no probability.
     """
     values = {name: node.get_parameter(name).value for name in names}
-    for name, allowed in CHOICES.items():
-        if name in values and values[name] not in allowed:
-            raise UserError(f'{name} is one of {", ".join(a or "(empty)" for a in allowed)}',
-                            values[name], f'set it with -p {name}:=...')
-    if -1.0 < values.get('stop_threshold', -1.0) < 0.0:
-        raise UserError('stop_threshold lies in [0, 1], or is -1', values['stop_threshold'],
-                        'set it with -p stop_threshold:=...')
+    for name, value in values.items():
+        check(name, value)
     return values

@@ -1,74 +1,95 @@
-"""The life of a node's process: signals, one-line errors, exit codes."""
+"""The life of a node's process: arguments, signals, one-line errors, exit codes."""
 
 from __future__ import annotations
 
-import signal
+import contextlib
+import itertools
+import os
+import re
 import sys
-from collections.abc import Callable
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
 
 import rclpy
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
 from vn_nav.errors import UserError
+from vn_nav.nodes import signals
+from vn_nav.nodes.parameters import help_lines
+from vn_nav.nodes.signals import Ended
+
+__all__ = ['Ended', 'compiling', 'run_node', 'spin']
+
+# What ROS says of words that it refuses, while it starts or makes a node.
+REFUSED = (NameValidationException, ParameterException,
+           rclpy._rclpy_pybind11.RCLError, rclpy._rclpy_pybind11.RCLInvalidROSArgsError,
+           rclpy._rclpy_pybind11.UnknownROSArgsError)
+USAGE = """usage: ros2 run vn_nav {name} [--ros-args [-p name:=value] [--params-file file]
+       [-r topic:=other] [-r __ns:=/namespace] [--log-level debug|info|warn|error|fatal]]
+
+{about}
+
+parameters (default; limits):
+{lines}"""
+REMEDIES = {  # by the word in front of what is refused
+    '--params-file': 'give a params file that exists, as config/policy.yaml is one',
+    '--log-level': 'the levels are debug, info, warn, error and fatal',
+    'parameter override': 'write -p name:=value',
+    'remap rule': 'write -r topic:=other, -r __ns:=/namespace or -r __node:=name',
+}
 
 
-class Ended:
-    """Becomes true at SIGINT or SIGTERM.
-
-    Not a `threading.Event`: a signal handler runs in the middle of what the main thread does, and
-    `Event.set` there waits for ever for the lock that an interrupted `Event.wait` holds.
-    """
-
-    def __init__(self):
-        self._ended = False
-        self._before = {number: signal.signal(number, self._on_signal)
-                        for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def _on_signal(self, *_):
-        self._ended = True
-
-    def is_set(self) -> bool:
-        """A signal has come."""
-        return self._ended
-
-    def restore(self) -> None:
-        """Leave the signals to whoever heard them before."""
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-
-def run_node(name: str, make: Callable[[], Node], work: Callable[[Node, Ended], None],
-             args: list[str] | None = None) -> int:
-    """Make a node, work until a signal, destroy it.
+def run_node(name: str, make: Callable[[Ended], Node], work: Callable[[Node, Ended], None],
+             args: list[str] | None = None, *, about: str = '',
+             parameters: Mapping[str, tuple] | None = None) -> int:
+    """Make a node, work until a signal, destroy it. Afterwards the process has to end.
 
     Args:
         name: of the program, in front of its error line.
         make: builds the node; its `destroy_node` lets go of everything.
         work: returns when it is done, or soon after a signal.
-        args: command line; None: the process's own.
+        args: command line without the program; None: the process's own.
+        about, parameters: what `--help` says: a text, and the table of `vn_nav.nodes.parameters`.
 
     Returns:
-        0; or 2 after a `UserError`, which is one line on standard error.
+        0; or 2 after a `UserError`, or arguments that ROS refuses, in one line on standard error.
     """
-    # rclpy's own handlers would close the context before the last message is out.
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    ended = Ended()
-    node = None
+    words = sys.argv[1:] if args is None else list(args)
+    if {'-h', '--help'} & set(itertools.takewhile(lambda word: word != '--ros-args', words)):
+        print(USAGE.format(name=name, about=about.strip(),
+                           lines='\n'.join(help_lines(parameters or {}))))
+        return 0
+    ended, node, code = Ended(), None, 0
     try:
-        node = make()
+        with _refusals():
+            with _silent():
+                own = remove_ros_args([name, *words])[1:]
+                if own:
+                    raise UserError('arguments of a node stand after --ros-args', ' '.join(own),
+                                    'see --help')
+                # rclpy's own handlers would close the context before the last message is out.
+                rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+            node = make(ended)
         work(node, ended)
     except UserError as error:
-        print(f'{name}: {error}', file=sys.stderr)
-        return 2
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            print(f'{name}: {error}', file=sys.stderr)
+        code = 2
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+        signals.ignore()  # the interpreter would otherwise end by the next one, in its shutdown
+        _flush()
+    return code
 
 
 def spin(node: Node, ended: Ended) -> None:
@@ -77,3 +98,77 @@ def spin(node: Node, ended: Ended) -> None:
     executor.add_node(node)
     while not ended.is_set():
         executor.spin_once(timeout_sec=0.2)
+
+
+@contextlib.contextmanager
+def compiling(node: Node, ended: Ended, words: str, period: float = 5.0) -> Iterator[None]:
+    """Slow work before a node can do anything: every few seconds it says that it goes on.
+
+    A signal ends the process at once, with exit code 0.
+    """
+    begun, done = time.monotonic(), threading.Event()
+
+    def say():
+        while not done.wait(period):
+            node.get_logger().info(f'{words}: {time.monotonic() - begun:.0f} s so far')
+
+    def let_go():
+        Node.destroy_node(node)
+        rclpy.try_shutdown()
+    thread = threading.Thread(target=say, daemon=True)
+    thread.start()
+    try:
+        with ended.leaving(let_go):
+            yield
+    finally:
+        done.set()
+        thread.join()
+    if (seconds := time.monotonic() - begun) >= period:
+        node.get_logger().info(f'{words}: done after {seconds:.0f} s')
+
+
+@contextlib.contextmanager
+def _refusals() -> Iterator[None]:
+    """Turn what ROS says of arguments into one line."""
+    try:
+        yield
+    except REFUSED as error:
+        # "Failed to parse ROS arguments: Couldn't ..., at /some/file.c:1": without its places.
+        said = ' '.join(re.sub(r', at /\S+:\d+', '', str(error)).split())
+        said = said.removeprefix('Failed to parse ROS arguments: ')
+        remedy = next((remedy for word, remedy in REMEDIES.items() if word in said), 'see --help')
+        raise UserError('arguments are as ROS wants them', said, remedy) from error
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep what ROS's C code writes on standard error, and drop it where the body fails.
+
+    It says on several lines what the exception says as well.
+    """
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield
+        except BaseException:
+            file.truncate(0)
+            raise
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            with contextlib.suppress(OSError):
+                os.write(2, file.read())
+
+
+def _flush() -> None:
+    """Write out what is buffered; where the terminal is gone, its end is not an error of ours."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, stream.fileno())
+            os.close(nothing)

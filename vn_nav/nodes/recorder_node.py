@@ -13,7 +13,6 @@ import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -23,6 +22,7 @@ from vn_nav.bags.definitions import definition
 from vn_nav.bags.losses import Losses
 from vn_nav.bags.recorder import MIN_FREE, BagWriter, RecordingStopped
 from vn_nav.errors import UserError
+from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import profile, qos
 
@@ -32,6 +32,18 @@ POLL = 0.005  # s between looks at the subscriptions when there was nothing
 LOOK = 0.2  # s between looks at who publishes
 REPORT = 1.0  # s
 TWIN = {'geometry_msgs/msg/Twist': 'geometry_msgs/msg/TwistStamped'}  # accepted in its place
+# name: (default, meaning, limits), as in `vn_nav.nodes.parameters`.
+PARAMETERS = {
+    'output': ('', 'folder of the bag; it must not exist; empty: rosbag2_ and the date'),
+    'topics': ([entry.name for entry in TOPICS],
+               'topics to record: names of the contract, or name:type'),
+    'all': (False, 'record whatever is published as well'),
+    'max_bag_size': (0, 'bytes of a file before the next is begun; 0: no limit', (0, 1 << 50)),
+    'max_bag_duration': (0.0, 'seconds of a file before the next is begun; 0: no limit',
+                         (0.0, 1e9)),
+    'min_free_space': (MIN_FREE, 'bytes of the disk that stay free: below that, recording stops',
+                       (0, 1 << 50)),
+}
 
 
 @dataclasses.dataclass
@@ -55,32 +67,18 @@ class RecorderNode(Node):
     def __init__(self):
         super().__init__('recorder_node')
 
-        def parameter(name, default, meaning, **limits):
-            return self.declare_parameter(name, default, ParameterDescriptor(
-                description=meaning, read_only=True, **limits)).value
-
-        def count(top):
-            return {'integer_range': [IntegerRange(from_value=0, to_value=top)]}
-
-        default = f'rosbag2_{datetime.datetime.now():%Y_%m_%d-%H_%M_%S}'
-        output = parameter('output', default, 'folder of the bag; it must not exist')
-        names = parameter('topics', [entry.name for entry in TOPICS],
-                          'topics to record: names of the contract, or name:type')
-        self.everything = parameter('all', False, 'record whatever is published as well')
-        max_bytes = parameter('max_bag_size', 0, 'bytes of a file before the next is begun; '
-                              '0: no limit', **count(1 << 50))
-        max_seconds = parameter('max_bag_duration', 0.0, 'seconds of a file before the next is '
-                                'begun; 0: no limit', floating_point_range=[
-                                    FloatingPointRange(from_value=0.0, to_value=1e9)])
-        min_free = parameter('min_free_space', MIN_FREE, 'bytes of the disk that stay free: below '
-                             'that, recording stops', **count(1 << 50))
+        value = parameters.declare(self, PARAMETERS, read_only=True,
+                                   others=policy_parameters.PARAMETERS)
+        output = value['output'] or f'rosbag2_{datetime.datetime.now():%Y_%m_%d-%H_%M_%S}'
+        self.everything = value['all']
         self.awaited: dict[str, str] = {}  # type by resolved name
         self.refused: set[str] = set()  # resolved names
-        entries = [entry for entry in map(self._wanted, names) if entry is not None]
+        entries = [entry for entry in map(self._wanted, value['topics']) if entry is not None]
         for entry in entries:
             _message(entry.type)
-        self.writer = BagWriter(output, max_bytes=max_bytes, max_seconds=max_seconds,
-                                min_free=min_free)
+        self.writer = BagWriter(output, max_bytes=value['max_bag_size'],
+                                max_seconds=value['max_bag_duration'],
+                                min_free=value['min_free_space'])
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics',
                                                  qos('/diagnostics'))
         self.stopped = False
@@ -322,8 +320,9 @@ def record(node: RecorderNode, ended: Ended) -> None:
 
 
 def main(args=None) -> int:
-    """Entry point: SIGINT and SIGTERM finish the bag."""
-    return run_node('recorder_node', RecorderNode, record, args)
+    """Entry point: a signal finishes the bag."""
+    return run_node('recorder_node', lambda _: RecorderNode(), record, args, about=__doc__,
+                    parameters=PARAMETERS)
 
 
 if __name__ == '__main__':

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import hashlib
 import json
 import math
 import threading
@@ -38,14 +39,18 @@ from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.process import Ended
-from vn_nav.nodes.qos import profile, qos
+from vn_nav.nodes.qos import profile, qos, subscribe
+from vn_nav.nodes.work_threads import WorkThreads
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
+from vn_nav.policy.frame_gate import shorten
+from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import ENABLED, STOP_SECONDS, Limits, Navigator, State
 from vn_nav.robot import RobotSpec
 
 NAME = 'training_node'
 PARAMETERS = ('image_transport', 'enable_stamped_cmd_vel', 'control_rate', 'frame_timeout',
-              'frame_stop_timeout', 'max_frame_age', 'max_frame_ahead', 'settle_time')
+              'frame_stop_timeout', 'max_frame_age', 'max_frame_ahead', 'odometry_timeout',
+              'settle_time')
 PATIENCE = 120.0  # s, default of the parameter `patience`
 LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step, as in policy_node
 VERDICT = 2.0  # s that the end of a decision in lock-step waits for its judge
@@ -110,7 +115,7 @@ class RosRobot(Node):
     def __init__(self, context: Context, namespace: str, robot: RobotSpec, size: int, *,
                  lock_step: bool, max_decisions: int, ended: Ended, bag: Path | None):
         super().__init__(NAME, namespace=namespace or None, context=context)
-        policy_parameters.declare(self, PARAMETERS)
+        policy_parameters.declare(self, PARAMETERS, others=None)
         self.patience = self.declare_parameter('patience', PATIENCE, ParameterDescriptor(
             description='without a picture, a goal or leave to move a training ends after [s]',
             floating_point_range=[FloatingPointRange(from_value=1.0, to_value=1e6)])).value
@@ -118,19 +123,21 @@ class RosRobot(Node):
         self.robot, self.size, self.lock_step = robot, size, lock_step
         self.max_decisions, self.ended = max_decisions, ended
         self.wake = threading.Condition()  # guards everything below, and wakes all threads
-        limits = (Limits(LOCK_STEP_LIMIT, LOCK_STEP_LIMIT, settle_time=0.0) if lock_step else
+        limits = (Limits(LOCK_STEP_LIMIT, LOCK_STEP_LIMIT, odometry_timeout=LOCK_STEP_LIMIT,
+                         settle_time=0.0) if lock_step else
                   Limits(**{name: value[name] for name in Limits.__dataclass_fields__
                             if name in value}))
         self.navigator = Navigator(robot, limits, exact=lock_step)
         self.output = CommandOutput(
-            self, self.navigator, self.wake, lambda: self._running,
-            period=1.0 / value['control_rate'], lock_step=lock_step,
-            stamped=value['enable_stamped_cmd_vel'])
+            self, self.navigator, self.wake, period=1.0 / value['control_rate'],
+            lock_step=lock_step, stamped=value['enable_stamped_cmd_vel'])
+        self._goal_watch = GoalWatch(trust_stamps=lock_step)
         self.camera_fov: float | None = None
         self.goal: np.ndarray | None = None
         self.scene: dict = {}
         self.failure: str = ''  # of a thread
-        self._running = self._held = False
+        self._held = False
+        self._threads: WorkThreads | None = None
         self._goals = 0  # that were taken
         self._frame: tuple[float, np.ndarray] | None = None  # the newest, of the present goal
         self._beside: dict[str, collections.deque] = {}  # (stamp, message) by key
@@ -142,7 +149,6 @@ class RosRobot(Node):
         self._stopped_since: float | None = None
         self._writer = BagWriter(bag) if bag is not None else None
         self._make_interfaces(value['image_transport'] == 'compressed')
-        self._thread = threading.Thread(target=self._guard, name='output', daemon=True)
 
     # Interfaces. Outcomes come first: of what has arrived, the executor serves the oldest
     # subscription first, and so the outcome of a decision before the picture that follows it.
@@ -153,8 +159,9 @@ class RosRobot(Node):
         self._hear(Bool, 'arrived', self._on_arrived, history=False)
         self._hear(UInt8, 'episode_end', self._on_episode_end, history=False)
         self._hear(String, 'scene', self._on_scene)
-        self._hear(Image, 'goal_image', self._on_goal)
-        self._hear(Odometry, 'odom', self.output.take_odometry)
+        self._hear(Image, 'goal_image', self._on_goal, anybody=True)
+        # In lock-step no odometry may be missed, and the simulator is reliable.
+        self._hear(Odometry, 'odom', self.output.take_odometry, anybody=not self.lock_step)
         self._hear(CameraInfo, 'camera_info', self._on_camera_info)
         self._hear(*((CompressedImage, 'image_raw/compressed') if compressed else
                      (Image, 'image_raw')), self._on_image)
@@ -172,7 +179,7 @@ class RosRobot(Node):
         self.create_timer(WATCH, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _hear(self, kind: type, name: str, handle: Callable[[Any], None], *,
-              history: bool = True) -> None:
+              history: bool = True, anybody: bool = False) -> None:
         """Subscribe to a topic of the contract.
 
         Args:
@@ -180,17 +187,28 @@ class RosRobot(Node):
             name: of the topic.
             handle: called with each.
             history: also what was said before, where the topic keeps it.
+            anybody: hear any publisher, whatever its quality of service.
         """
         entry = topic(name)
         record = self._recording(name)
         if self._writer is not None:
             self._writer.add(entry)
 
+        last = None
+
         def callback(message, info) -> None:
+            nonlocal last
+            this = (info['source_timestamp'], info.get('publication_sequence_number'))
+            if anybody and this == last:  # heard by another subscription of the topic
+                return
+            last = this
             record(message, info)
             handle(message)
-        self.create_subscription(kind, name, callback, profile(
-            entry if history else dataclasses.replace(entry, durability=VOLATILE)))
+        if anybody:
+            subscribe(self, kind, name, callback)
+        else:
+            self.create_subscription(kind, name, callback, profile(
+                entry if history else dataclasses.replace(entry, durability=VOLATILE)))
 
     def _recording(self, name: str) -> Callable[[Any, dict], None]:
         def record(message, info) -> None:
@@ -233,6 +251,7 @@ class RosRobot(Node):
     # Callbacks, on the executor's thread.
 
     def _on_image(self, message) -> None:
+        received = time.monotonic()
         stamp = _seconds(message.header.stamp)
         with self.wake:
             # In lock-step stamps are the simulator's ticks and nothing is late.
@@ -240,26 +259,29 @@ class RosRobot(Node):
                 return
         try:
             picture = self._prepare(message)
-        except (images.ImageError, UserError) as error:
+        except Exception as error:  # whatever is wrong with it: as good as no picture
             with self.wake:
-                self.navigator.bad_frame(str(error), time.monotonic())
+                self.navigator.bad_frame(str(error) or repr(error), time.monotonic())
+                self.wake.notify_all()
             return
         with self.wake:
-            self.navigator.good_frame(time.monotonic())
+            self.navigator.good_frame(received)
             self._frame = (stamp, picture)
             self.wake.notify_all()
 
     def _on_goal(self, message: Image) -> None:
         stamp = message.header.stamp
+        content = hashlib.blake2b(message.data, digest_size=16).digest()
         with self.wake:
-            if not self.navigator.new_goal((stamp.sec, stamp.nanosec)):
+            if not self._goal_watch.is_new((stamp.sec, stamp.nanosec), content, time.monotonic()):
                 return
+            self.navigator.new_goal()
         try:
             picture = self._prepare(message)
-        except (images.ImageError, UserError) as error:
-            self.get_logger().error(f'goal_image refused: {error}')
+        except Exception as error:  # whatever is wrong with it: a picture moves no robot
+            self.get_logger().error(f'goal_image refused: {shorten(str(error))}')
             with self.wake:
-                self.navigator.refuse_goal()
+                self.navigator.refuse_goal(str(error))
             return
         with self.wake:
             # Pictures up to then belong to the episode before.
@@ -342,8 +364,7 @@ class RosRobot(Node):
         self._until(lambda: not self._missing(), lambda: f'waits for {", ".join(self._missing())}')
         if self.camera_fov is not None:
             crop_fraction(self.camera_fov, self.robot.camera_fov)
-        self._running = True
-        self._thread.start()
+        self._threads = WorkThreads({'output': self.output.run}, self._on_failed_thread)
 
     def _missing(self) -> list[str]:
         found = (('image_raw', self._frame is not None),
@@ -414,11 +435,13 @@ class RosRobot(Node):
     def halt(self) -> None:
         """End the output thread with a zero command that has been delivered; end the bag."""
         with self.wake:
-            running, self._running = self._running, False
+            running = self._running
+            if running:
+                self._threads.end()
             self.navigator.stop('the training ends', time.monotonic())
             self.wake.notify_all()
         if running:
-            self._thread.join(timeout=1.0)
+            self._threads.join('output')  # it waits for nothing but `wake`
             self.output.deliver_zero()  # the output thread is gone: still only one owner
         writer, self._writer = self._writer, None
         if writer is not None:
@@ -496,7 +519,7 @@ class RosRobot(Node):
         rules = (
             (self._held, '~/stop was called: call ~/reset'),
             (self._other_publishers(), 'another node publishes on cmd_vel: end it, or remap one'),
-            (self.output.silence > self.navigator.limits.frame_timeout, 'odometry is silent'),
+            (self.output.silence > self.navigator.limits.odometry_timeout, 'odometry is silent'),
             (not self._listeners(), f'nobody is {self._listener_words()}'),
         )
         return tuple(words for broken, words in rules if broken)
@@ -547,16 +570,13 @@ class RosRobot(Node):
         return (f'listening for {kind.__name__} on cmd_vel (for {other.__name__} set '
                 f'enable_stamped_cmd_vel to {str(kind is Twist).lower()})')
 
-    def _guard(self) -> None:
-        """The output thread; when it fails, zero first."""
-        try:
-            self.output.run()
-        except Exception as error:  # whatever it was
-            self.fail(f'the output thread failed: {error!r}')
-            for _ in range(20):
-                self.output.send(np.zeros(4))
-                time.sleep(0.05)
-            raise
+    @property
+    def _running(self) -> bool:
+        return self._threads is not None and self._threads.is_running()
+
+    def _on_failed_thread(self, name: str, error: Exception) -> None:
+        self.fail(f'the {name} thread failed: {error!r}')
+        self.output.deliver_zero()
 
 
 def _seconds(stamp) -> float:

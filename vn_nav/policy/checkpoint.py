@@ -9,7 +9,9 @@ import ctypes
 import dataclasses
 import hashlib
 import json
+import math
 import os
+import reprlib
 import shutil
 from pathlib import Path
 
@@ -21,13 +23,19 @@ from vn_nav.errors import UserError
 from vn_nav.files import sync_folder, write_file
 from vn_nav.policy.checkpoint_info import (
     CARD,
+    CHECKSUM,
     CONFIG,
     FORMAT,
+    NUMBER,
     WEIGHTS,
     check_info,
+    config_checksum,
     read_config,
 )
 from vn_nav.policy.network import NetworkConfig, Policy
+
+HEADER_BYTES = 1_000_000  # of a safetensors file, beside its weights
+MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +80,9 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
     }
     del config['network']['actions']  # said once, under action_names
     try:
+        # As it will be read: JSON has no tuples, and only text as keys.
+        config = json.loads(json.dumps(config, allow_nan=False))
+        config[CHECKSUM] = config_checksum(config)
         text = json.dumps(config, indent=2, allow_nan=False) + '\n'
     except (TypeError, ValueError) as error:
         raise UserError('info holds only JSON values', str(error), 'convert them first') from error
@@ -96,39 +107,98 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
         expect_actions: refuse any other action names or order.
 
     Raises:
-        UserError: a missing file, corrupt weights, another architecture, unknown keys, or other
-            actions.
+        UserError: a missing or corrupt file, another architecture, unknown keys, values of a
+            wrong type or size, or other actions.
     """
     folder = Path(folder)
     config, info = read_config(folder)
     where = str(folder / CONFIG)
-    weights = (folder / WEIGHTS).read_bytes()
+    network_config, shapes = _read_network(config, where)
+    if expect_actions is not None and tuple(expect_actions) != network_config.actions:
+        raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
+                        ', '.join(network_config.actions), 'use a checkpoint trained for them')
+    weights = _read_weights(folder / WEIGHTS, shapes)
     digest = hashlib.sha256(weights).hexdigest()
     if digest != config['sha256']:
         raise UserError(f'the SHA-256 of {WEIGHTS} is the one in {CONFIG}', digest,
                         f'the file is corrupt or not the one of {where}: get it again')
-    try:
-        network_config = NetworkConfig(actions=tuple(config['action_names']), **config['network'])
-    except TypeError as error:
-        known = ', '.join(field.name for field in dataclasses.fields(NetworkConfig))
-        raise UserError(f'the network in {CONFIG} has only the fields {known}',
-                        f'{where}: {error}', 'use the version of vn_nav that wrote it, or '
-                        'train again') from error
-    if expect_actions is not None and tuple(expect_actions) != network_config.actions:
-        raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
-                        ', '.join(network_config.actions), 'use a checkpoint trained for them')
+    tensors = _check_weights(weights, shapes, str(folder / WEIGHTS))
     network = Policy(network_config)
-    _load_weights(network, weights, str(folder / WEIGHTS))
+    network.load_state_dict(tensors)
     return LoadedCheckpoint(network.eval(), network_config, {**info, 'sha256': digest})
 
 
-def _load_weights(network: Policy, weights: bytes, where: str) -> None:
+def _read_network(config: dict, where: str) -> tuple[NetworkConfig, dict[str, tuple]]:
+    """The network of a `config.json`, and the shapes of its weights by name.
+
+    The shapes come from a network without memory: an absurd size must not be allocated.
+    """
+    names, given = config['action_names'], config['network']
+    if not (isinstance(names, list) and len(names) <= 256
+            and all(isinstance(name, str) for name in names)):
+        raise UserError('action_names is a list of at most 256 names',
+                        f'{where}: {reprlib.repr(names)}', 'get the checkpoint again')
+    if not isinstance(given, dict):
+        raise UserError(f'the network in {CONFIG} is a mapping', f'{where}: {reprlib.repr(given)}',
+                        'get the checkpoint again')
+    fields = {field.name: field.default for field in dataclasses.fields(NetworkConfig)
+              if field.name != 'actions'}
+    for name, value in given.items():
+        if name not in fields:
+            raise UserError(f'the network in {CONFIG} has only the fields {", ".join(fields)}',
+                            f'{where}: {name}', 'use the version of vn_nav that wrote it, or '
+                            'train again')
+        if not _fits(value, fields[name]):
+            raise UserError(f'{name} of the network in {CONFIG} is of the type and '
+                            f'size of {fields[name]!r}', f'{where}: {reprlib.repr(value)}',
+                            'get the checkpoint again')
+    try:
+        network = NetworkConfig(actions=tuple(names), **given)
+        with torch.device('meta'):
+            shapes = {name: tuple(tensor.shape)
+                      for name, tensor in Policy(network).state_dict().items()}
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise UserError(f'the network in {CONFIG} can be built',
+                        f'{where}: {" ".join(str(error).split())[:200]}',
+                        'get the checkpoint again') from error
+    return network, shapes
+
+
+def _fits(value: object, default: object) -> bool:
+    """Whether a value out of JSON has the type of a field of `NetworkConfig`."""
+    if isinstance(default, tuple):
+        return isinstance(value, list) and all(
+            isinstance(part, (str, int)) or (isinstance(part, list) and all(
+                _fits(number, 0.0) for number in part)) for part in value)
+    if isinstance(default, float):
+        return (isinstance(value, NUMBER) and not isinstance(value, bool)
+                and math.isfinite(value))
+    return type(value) is type(default) and not (type(value) is int and abs(value) > MAX_SIZE)
+
+
+def _read_weights(path: Path, shapes: dict[str, tuple]) -> bytes:
+    """The file's bytes, no more than these weights can have."""
+    most = 4 * sum(map(math.prod, shapes.values())) + HEADER_BYTES
+    try:
+        with path.open('rb') as file:
+            weights = file.read(min(most, path.stat().st_size) + 1)
+    except OSError as error:
+        raise UserError(f'{WEIGHTS} can be read', f'{path}: {error.strerror}',
+                        'correct its permissions, or get the checkpoint again') from error
+    if len(weights) > most:
+        raise UserError(f'{WEIGHTS} fits the network of {CONFIG}: at most {most} bytes',
+                        f'{path.stat().st_size} in {path}', 'get the checkpoint again')
+    return weights
+
+
+def _check_weights(weights: bytes, wanted: dict[str, tuple], where: str
+                   ) -> dict[str, torch.Tensor]:
+    """The weights by name, float32."""
     try:
         tensors = safetensors.torch.load(weights)
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, KeyError, ValueError) as error:
         raise UserError(f'{WEIGHTS} is a safetensors file', f'{where}: {error}',
                         'get the checkpoint again') from error
-    wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     if wanted != found:
         name = sorted(name for name in wanted.keys() | found.keys()
@@ -139,7 +209,7 @@ def _load_weights(network: Policy, weights: bytes, where: str) -> None:
         if tensor.dtype not in (torch.float16, torch.float32) or not torch.isfinite(tensor).all():
             raise UserError('weights are finite numbers of 16 or 32 bits', f'{name} in {where}',
                             'get the checkpoint again')
-    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    return {name: tensor.float() for name, tensor in tensors.items()}
 
 
 def model_card(config: dict, parameters: int, size: int) -> str:
@@ -158,15 +228,20 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
             config['decoding']],
         'Network': f'{_describe(network)}; {parameters:,} parameters, {size / 1e6:.1f} MB',
-        'Trained in': home,
-        'Training': f'{config["frames"]:,} frames (agent decisions) in {config["minutes"]:.1f} '
-                    f'minutes, seed {config["seed"]}',
+        'Trained in': config['data'] or home,
+        **({'Losses': ', '.join(config['losses']).replace('_', ' ')} if config['losses'] else {}),
+        'Training': ('no episode was driven; ' if config['data'] and not config['frames'] else
+                     f'{config["frames"]:,} frames (agent decisions) in ')
+        + f'{config["minutes"]:.1f} minutes, seed {config["seed"]}',
         'World version': config['world_version'],
         'Weights': f'SHA-256 `{config["sha256"]}`',
     }
+    purpose = ('Drives a robot to the place where a picture was taken.' if not config['losses']
+               else 'Weights to begin a training with (`vn_nav train --init`), pre-trained on '
+               'recorded pictures. No episode was driven: whether it arrives is not known.')
     lines = ['# Visual navigation policy', '',
-             'Drives a robot to the place where a picture was taken. It sees its camera, the goal '
-             'picture and its own last action; no map, no depth, no pose.', '',
+             f'{purpose} It sees its camera, the goal picture and its own last action; no map, no '
+             'depth, no pose.', '',
              '| | |', '|---|---|', *(f'| {key} | {value} |' for key, value in facts.items())]
     if config['command']:
         lines += ['', 'Trained with', '', '```', str(config['command']), '```']

@@ -19,6 +19,7 @@ import enum
 
 import numpy as np
 
+from vn_nav.policy.frame_gate import FrameGate, shorten
 from vn_nav.policy.motion import ActionExecutor, cruise, ramp
 from vn_nav.robot import RobotSpec
 
@@ -55,6 +56,7 @@ class Limits:
     max_frame_age: float = 0.25
     max_frame_ahead: float = 0.05
     inference_timeout: float = 0.1
+    odometry_timeout: float = 0.5  # odometry silence: zero; in motion a latched stop
     settle_time: float = 0.1  # after a motion, before a frame shows the robot at rest
 
 
@@ -75,19 +77,19 @@ class Navigator:
                          else ActionExecutor(robot, tolerance=0.004, creep=0.02))
         self.state, self.reason = State.IDLE, 'not enabled'
         self.phase = Phase.LOOK
-        self.goal_identity: object = None
         self.goal_ready = False
         self.velocity = np.zeros(4)
         self.decisions = 0  # in this episode
         self.cut_off = 0  # motions, or decisions to move, that were given up before their end
         self.arrival: float | None = None  # probability at which arrival was declared
-        self.dropped: dict[str, int] = {}  # frames by reason
+        self.gate = FrameGate(limits.max_frame_age, limits.max_frame_ahead)
+        self.epoch = 0  # grows when time was set: what the policy remembers is of another time
+        self.goal_refusal = ''  # why the newest goal picture was unusable
         self._target = np.zeros(4)
         self._stopped_at = 0.0
         self._idle_from: float | None = -np.inf  # steady time of leaving motion; None: just now
         self._healthy_since: float | None = None
-        self._last_frame: float | None = None  # steady time of the newest good frame
-        self._last_stamp = -np.inf
+        self._last_frame: float | None = None  # steady time at which the newest good frame came
         self._look_after = -np.inf  # stamp that the next decision's frame must exceed
         self._bad_frames = self._late_inferences = 0
         self._ticket = 0
@@ -96,33 +98,32 @@ class Navigator:
 
     # Frames.
 
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Frames that were dropped, by kind."""
+        return self.gate.dropped
+
     def admit(self, stamp: float, clock: float | None) -> bool:
         """May a frame be used? Judges its stamp against the last one and the clock [s].
 
-        A frame that may not is counted in `dropped`, and is as good as none.
+        A frame that may not is counted in `dropped`, and is as good as none. One that comes from
+        a time that was set back is the first of the new time.
         """
-        reason = None
-        if stamp <= self._last_stamp:
-            reason = 'reordered or duplicate stamp'
-        elif clock is not None and clock - stamp > self.limits.max_frame_age:
-            reason = f'stamp older than {self.limits.max_frame_age} s'
-        elif clock is not None and stamp - clock > self.limits.max_frame_ahead:
-            reason = f'stamp more than {self.limits.max_frame_ahead} s ahead'
-        if reason:
-            self.dropped[reason] = self.dropped.get(reason, 0) + 1
-            return False
-        self._last_stamp = stamp
-        return True
+        if back := self.gate.went_back(stamp, clock):
+            self.time_jumped(f'camera stamps went back by {back:.4g} s')
+        return self.gate.admit(stamp, clock)
 
-    def time_jumped(self) -> None:
-        """The clock went back: forget old stamps, and stand still until enabled again."""
-        self._last_stamp = self._look_after = -np.inf
+    def time_jumped(self, reason: str) -> None:
+        """A clock was set: forget old stamps, and stand still until enabled again."""
+        self.gate.forget()
+        self._look_after = -np.inf
         self._healthy_since = None
+        self.epoch += 1
         if self.state in ENABLED:
-            self._idle('the clock went back: enable again')
+            self._idle(f'{reason}: enable again')
 
     def good_frame(self, now: float) -> None:
-        """An admitted frame has been decoded."""
+        """An admitted frame, which came at steady time `now`, has been decoded."""
         gap = None if self._last_frame is None else now - self._last_frame
         if self._healthy_since is None or gap is None or gap > max(
                 self.limits.frame_timeout, self.limits.inference_timeout):
@@ -132,32 +133,31 @@ class Navigator:
 
     def bad_frame(self, reason: str, now: float) -> None:
         """An admitted frame could not be decoded. Three in a row stop the robot."""
-        self.dropped[reason] = self.dropped.get(reason, 0) + 1
+        self.gate.unusable(reason)
         self._bad_frames += 1
         self._healthy_since = None
         if self._bad_frames >= 3 and self.state in ENABLED:
-            self.stop(f'three bad frames in a row: {reason}', now)
+            self.stop(f'three bad frames in a row: {self.gate.last}', now)
 
     # Goals.
 
-    def new_goal(self, identity: object) -> bool:
-        """A goal picture came; True when it is another than the present one (a new episode)."""
-        if identity == self.goal_identity:
-            return False
-        self.goal_identity, self.goal_ready, self.arrival = identity, False, None
+    def new_goal(self) -> None:
+        """Another goal picture came: a new episode, which begins with standing still."""
+        self.goal_ready, self.arrival, self.goal_refusal = False, None, ''
         self._abandon()
         if self.state in (State.RUNNING, State.ARRIVED):
             self.state, self.reason = State.HOLD, 'goal changed'
-        return True
 
     def accept_goal(self, stamp: float) -> None:
         """The policy knows the goal. Frames up to `stamp` belong to the episode before."""
         self.goal_ready, self.decisions = True, 0
         self._look_after = stamp
 
-    def refuse_goal(self) -> None:
+    def refuse_goal(self, why: str) -> None:
         """The goal picture was unusable: as if there were none."""
-        self.goal_identity, self.goal_ready = None, False
+        self.goal_ready, self.goal_refusal = False, shorten(why)
+        if self.state is State.HOLD:
+            self.reason = f'goal refused: {self.goal_refusal}'
 
     # Commands of people.
 
@@ -170,10 +170,12 @@ class Navigator:
         if self.state is State.STOPPED:
             missing.append(f'stopped ({self.reason}): call ~/reset first')
         if not self.goal_ready:
-            missing.append('no usable goal: publish a picture on goal_image')
+            missing.append('no usable goal: publish a picture on goal_image'
+                           + (f' ({self.goal_refusal})' if self.goal_refusal else ''))
         silent = self._last_frame is None or now - self._last_frame > self.limits.frame_timeout
         if silent or self._healthy_since is None:
-            missing.append('no healthy frames: check image_raw' + self._drops())
+            drops = self.gate.summary()
+            missing.append('no healthy frames: check image_raw' + (f' ({drops})' if drops else ''))
         elif now - self._healthy_since < ARMING_SECONDS:
             missing.append(f'frames are healthy for less than {ARMING_SECONDS:.0f} s: try again')
         if missing:
@@ -184,9 +186,6 @@ class Navigator:
             self.state, self.reason = State.RUNNING, ''
         return True, 'enabled'
 
-    def _drops(self) -> str:
-        return '; '.join(f' (dropped {n}: {reason})' for reason, n in self.dropped.items())
-
     def disable(self) -> None:
         """Zero at once, repeated for `STOP_SECONDS`, then silence; not latched."""
         if self.state is not State.STOPPED:
@@ -195,7 +194,7 @@ class Navigator:
     def stop(self, reason: str, now: float) -> None:
         """Zero at once, latched."""
         if self.state is not State.STOPPED:
-            self.state, self.reason, self._stopped_at = State.STOPPED, reason, now
+            self.state, self.reason, self._stopped_at = State.STOPPED, shorten(reason), now
         self.arrival = None
         self._abandon()
 
@@ -282,7 +281,21 @@ class Navigator:
         """A decision waits for the output thread."""
         return self._pending_action is not None and self.state is State.RUNNING
 
+    def odometry_jumped(self, reason: str) -> None:
+        """The pose is elsewhere at once: what is measured of the action under way is worthless."""
+        if self.state is State.RUNNING and self.velocity.any():
+            self._abandon()
+            self.state, self.reason = State.HOLD, reason
+
     # Velocities, asked for by the output thread.
+
+    def deadline(self) -> float:
+        """The steady time at which `step` has to be asked again, whatever comes meanwhile."""
+        if self.state is not State.RUNNING or self._last_frame is None:
+            return np.inf
+        return min(self._last_frame + self.limits.frame_timeout,
+                   np.inf if self._inferring_since is None
+                   else self._inferring_since + self.limits.inference_timeout)
 
     def step(self, now: float, dt: float, odometry: np.ndarray | None, stamp: float,
              *, odometry_lost: bool = False) -> np.ndarray | None:
@@ -294,7 +307,7 @@ class Navigator:
             stamp: present time in the frames' clock [s].
             odometry_lost: there was odometry, and it fell silent: nobody drives blind.
         """
-        if odometry_lost and self.executor.action is not None:
+        if odometry_lost and self.state is State.RUNNING and self.velocity.any():
             self.stop('odometry fell silent in motion', now)
         if self.state is State.STOPPED:
             return np.zeros(4) if now - self._stopped_at < STOP_SECONDS else None

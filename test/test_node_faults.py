@@ -1,0 +1,377 @@
+"""policy_node under faults: a real process, real topics, a robot that misbehaves.
+
+What must hold is the fault table of docs/safety.md.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import rclpy
+from fake_robot import BEST_EFFORT, RELIABLE, FakeRobot
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.msg import Transition
+from nav_msgs.msg import Odometry
+from ros_harness import child, wait_until, write_checkpoint
+from sensor_msgs.msg import CameraInfo
+from std_srvs.srv import SetBool, Trigger
+
+from vn_nav.nodes.qos import qos
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+NODE = 'vn_nav.nodes.policy_node'
+
+
+@pytest.fixture(scope='module')
+def checkpoint(tmp_path_factory):
+    return write_checkpoint(tmp_path_factory.mktemp('policy') / 'checkpoint')
+
+
+@contextmanager
+def robot_and_node(checkpoint, tmp_path, *, node=None, robot=None):
+    """A fake robot beside the node as a process: (robot, process)."""
+    rclpy.init()
+    fake = FakeRobot(**(robot or {}))
+    try:
+        with child(NODE, tmp_path / 'log', checkpoint=checkpoint, **(node or {})) as process:
+            yield fake, process
+    finally:
+        fake.close()
+        rclpy.shutdown()
+
+
+@contextmanager
+def broken_node(checkpoint, tmp_path, fault, **parameters):
+    """A fake robot beside a node with a fault that is put into its process: (robot, process)."""
+    words = [f'checkpoint:={checkpoint}', *(f'{k}:={v}' for k, v in parameters.items())]
+    arguments = ['--ros-args', *(word for pair in words for word in ('-p', pair))]
+    script = f'{fault}\nimport sys\nfrom vn_nav.nodes.policy_node import main\nsys.exit(main())'
+    rclpy.init()
+    fake = FakeRobot(odometry=RELIABLE)
+    with open(tmp_path / 'log', 'w') as log:
+        process = subprocess.Popen([sys.executable, '-c', script, *arguments], stdout=log,
+                                   stderr=log, env=os.environ | {'OMP_NUM_THREADS': '1'})
+    try:
+        yield fake, process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        fake.close()
+        rclpy.shutdown()
+
+
+# What the node hears.
+
+def test_best_effort_odometry_is_heard_and_its_silence_stops(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, robot={'odometry': BEST_EFFORT}) as (robot, _):
+        robot.drive()
+        robot.sends.discard('odom')
+        silent = time.monotonic()
+        assert robot.wait_for_zero() - silent < 0.8
+        robot.says('odometry fell silent')
+
+
+@pytest.mark.parametrize('profile', [BEST_EFFORT, RELIABLE], ids=['best effort', 'volatile'])
+def test_a_goal_of_any_publisher_is_heard(checkpoint, tmp_path, profile):
+    with robot_and_node(checkpoint, tmp_path, robot={'goal': profile}) as (robot, _):
+        wait_until(lambda: robot.goal.get_subscription_count() >= 1, robot.spin)
+        robot.spin_for(1.0)  # the other side has met this one as well
+        robot.drive()
+
+
+def test_odometry_of_another_type_or_without_a_word_refuses_to_enable(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path) as (robot, _):
+        other = robot.node.create_publisher(PoseStamped, 'odom', RELIABLE)
+        robot.show_goal()
+        robot.says('geometry_msgs/msg/PoseStamped', 20)
+        assert 'geometry_msgs/msg/PoseStamped' in robot.refusal()
+        robot.node.destroy_publisher(other)
+        silent = robot.node.create_publisher(Odometry, 'odom', RELIABLE)
+        wait_until(lambda: 'nothing of it has come' in robot.refusal(), robot.spin, 10)
+        robot.node.destroy_publisher(silent)
+        robot.enable()
+        robot.says('actions run on time alone')
+
+
+def test_required_odometry_is_waited_for(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, node={'require_odometry': True},
+                        robot={'odometry': RELIABLE}) as (robot, _):
+        robot.sends.discard('odom')
+        robot.show_goal()
+        robot.spin_for(1.5)
+        assert 'odometry' in robot.refusal()
+        robot.sends.add('odom')
+        robot.enable()
+
+
+def test_a_simulator_that_is_reset_is_driven_again(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, node={'use_sim_time': True},
+                        robot={'odometry': RELIABLE, 'sim_time': True}) as (robot, _):
+        robot.begun -= 1000.0
+        robot.drive()
+        robot.begun = time.monotonic() - 1.0  # /clock and all stamps: from 1,000 s to 1 s
+        assert robot.wait_for_zero() - time.monotonic() < 0.5
+        robot.says('went back')
+        robot.enable(10)
+        wait_until(robot.moving, robot.spin, 10)
+
+
+def test_a_camera_whose_stamps_go_back_is_used_again(checkpoint, tmp_path):
+    """Two takes of a bag, a driver restarted: in lock-step no clock says so but the stamps."""
+    with robot_and_node(checkpoint, tmp_path, node={'max_frame_age': 5.0},
+                        robot={'odometry': RELIABLE}) as (robot, _):
+        robot.drive()
+        robot.offset = -4.9  # still within the age that is allowed: the order alone tells
+        robot.spin_for(0.3)
+        robot.offset = 0.0
+        robot.spin_for(0.3)
+        robot.enable(10)
+        wait_until(robot.moving, robot.spin, 10)
+
+
+def test_a_clock_that_jumps_ahead_stands_still(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, node={'use_sim_time': True},
+                        robot={'odometry': RELIABLE, 'sim_time': True}) as (robot, _):
+        robot.drive()
+        robot.begun -= 100.0
+        robot.wait_for_zero()
+        robot.says('jumped ahead')
+
+
+def test_without_a_clock_it_does_not_become_active(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, node={'use_sim_time': True},
+                        robot={'odometry': RELIABLE, 'sim_time': True}) as (robot, _):
+        robot.sends.discard('clock')
+        robot.show_goal()
+        robot.spin_for(2.0)
+        refusal = robot.refusal()
+        assert 'not active' in refusal and '/clock' in refusal
+        robot.sends.add('clock')
+        robot.enable()
+
+
+def test_a_goal_published_at_a_rate_is_one_goal_and_is_named(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, robot={'odometry': RELIABLE}) as (robot, _):
+        robot.show_goal()
+        robot.enable()
+        end, due, drove = time.monotonic() + 5.0, 0.0, False
+        while time.monotonic() < end:
+            if time.monotonic() > due:
+                due = time.monotonic() + 0.1
+                robot.show_goal()  # the same picture, a new stamp
+            robot.spin()
+            drove |= robot.moving()
+        assert drove
+        robot.says('publish it once')
+        assert int(robot.statuses[-1][3]['decisions']) > 0
+        end = time.monotonic() + 4.0
+        while time.monotonic() < end:
+            if time.monotonic() > due:
+                due = time.monotonic() + 0.1
+                robot.show_goal(robot.images)  # another picture each time
+            robot.spin()
+        robot.says('each picture is a new goal')
+
+
+def test_another_goal_with_the_old_stamp_is_another_goal(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, robot={'odometry': RELIABLE}) as (robot, _):
+        stamp = robot.stamp()
+        robot.show_goal(0, stamp)
+        robot.enable()
+        robot.spin_for(0.5)
+        answers = len(robot.arrived)
+        robot.show_goal(0, stamp)
+        robot.spin_for(0.5)
+        assert len(robot.arrived) == answers, 'the same picture and stamp are the same goal'
+        robot.show_goal(1, stamp)
+        wait_until(lambda: len(robot.arrived) > answers, robot.spin, 5)
+
+
+def test_a_camera_on_another_clock_is_named_with_the_cure(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path) as (robot, _):
+        robot.offset = -37.0
+        robot.show_goal()
+        robot.spin_for(1.5)
+        refusal = robot.refusal()
+        assert '37.0' in refusal and all(
+            word in refusal for word in ('use_sim_time', 'NTP', 'max_frame_age'))
+        robot.offset = 12.0
+        wait_until(lambda: 'max_frame_ahead' in robot.refusal(), robot.spin, 5)
+
+
+# What happens inside.
+
+SLOW = """
+import time
+from vn_nav.policy.runtime import PolicyRuntime
+act = PolicyRuntime.act
+calls = []
+def slow(self, image):
+    calls.append(1)
+    time.sleep(1.5 if len(calls) > 8 else 0)
+    return act(self, image)
+PolicyRuntime.act = slow
+"""
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, None],
+                         ids=['SIGINT', 'SIGTERM', 'deactivate'])
+def test_the_last_zero_does_not_wait_for_a_decision(checkpoint, tmp_path, number):
+    with broken_node(checkpoint, tmp_path, SLOW, mode='continuous',
+                     inference_timeout='2.0', frame_timeout='5.0',
+                     frame_stop_timeout='10.0') as (robot, process):
+        robot.show_goal()
+        robot.enable()
+        wait_until(robot.moving, robot.spin)
+        robot.spin_for(0.8)  # by now a decision is under way, and the last one's motion goes on
+        assert robot.moving()
+        asked = time.monotonic()
+        if number is None:
+            assert robot.transition(Transition.TRANSITION_DEACTIVATE)
+        else:
+            os.kill(process.pid, number)
+        assert robot.wait_for_zero() - asked < 0.4
+        if number is not None:
+            wait_until(lambda: process.poll() is not None, robot.spin, 15)
+            assert process.returncode == 0, (tmp_path / 'log').read_text()
+            assert 'abort' not in (tmp_path / 'log').read_text().lower()
+
+
+BROKEN = """
+from vn_nav.policy.runtime import PolicyRuntime
+act = PolicyRuntime.act
+calls = []
+def broken(self, image):
+    calls.append(1)
+    if len(calls) == 5:
+        raise RuntimeError('the accelerator is gone')
+    return act(self, image)
+PolicyRuntime.act = broken
+"""
+
+
+def test_a_thread_that_dies_takes_the_node_out_of_action(checkpoint, tmp_path):
+    with broken_node(checkpoint, tmp_path, BROKEN, mode='continuous') as (robot, process):
+        robot.show_goal()
+        robot.enable()
+        robot.says('the accelerator is gone', 20)
+        robot.wait_for_zero()
+        refusal = robot.refusal()
+        assert 'not active' in refusal and 'the accelerator is gone' in refusal
+        assert process.poll() is None and 'Traceback' not in (tmp_path / 'log').read_text()
+        assert robot.transition(Transition.TRANSITION_ACTIVATE)
+        robot.enable()
+        wait_until(robot.moving, robot.spin)
+
+
+def test_messages_that_no_camera_sends_end_no_thread(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, robot={'odometry': RELIABLE}) as (robot, _):
+        robot.drive()
+        for focal in (1e-300, 1e300, float('nan'), -1.0):
+            info = CameraInfo(width=84, height=84)
+            info.k[0] = focal
+            robot.info.publish(info)
+        robot.spin_for(0.5)
+        wait_until(robot.moving, robot.spin)
+        robot.pose[:2] = 1e308
+        robot.publish_odometry()
+        robot.pose[:2] = 0.0
+        robot.wait_for_zero()
+        robot.says('bad odometry')
+        assert robot.call(Trigger, 'reset').success
+        robot.enable()
+        wait_until(robot.moving, robot.spin)
+
+
+def test_odometry_that_is_set_anew_ends_the_action(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, robot={'odometry': RELIABLE}) as (robot, _):
+        robot.drive()
+        robot.pose[:2] += 20.0
+        robot.wait_for_zero(1.0)
+        wait_until(robot.moving, robot.spin)
+
+
+def test_dropped_frames_are_counted_by_kind(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path) as (robot, _):
+        wait_until(lambda: robot.statuses, robot.spin)
+        robot.sends.discard('image')
+        for number in range(300):
+            message = robot.picture()
+            message.encoding = f'nonsense{number}' * 500
+            robot.image.publish(message)
+            robot.spin_for(0.01)
+        status = robot.says('nonsense')
+        assert sum(len(key) + len(value) for key, value in status[3].items()) < 2000
+        assert sum(key.startswith('dropped') for key in status[3]) <= 4
+
+
+# Time.
+
+def test_silence_is_noticed_at_its_deadline(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path,
+                        robot={'size': (640, 480), 'odometry': RELIABLE}) as (robot, _):
+        robot.show_goal()
+        robot.enable()
+        late = []
+        for _ in range(5):
+            wait_until(robot.moving, robot.spin)
+            robot.sends.discard('image')
+            silent = time.monotonic()
+            late.append(robot.wait_for_zero() - silent)
+            robot.sends.add('image')
+        assert np.median(late) < 0.30, late
+
+
+def test_continuous_decides_at_nearly_every_frame(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, node={'mode': 'continuous'},
+                        robot={'odometry': RELIABLE}) as (robot, _):
+        robot.drive()
+        robot.spin_for(1.5)
+        status, frames = robot.statuses[-1], robot.images
+        robot.spin_for(4.0)
+        decided = int(robot.statuses[-1][3]['decisions']) - int(status[3]['decisions'])
+        frames = (robot.statuses[-1][0] - status[0]) * 30
+        assert decided > 0.85 * frames, (decided, frames)
+
+
+def test_continuous_stops_when_odometry_falls_silent_in_motion(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, node={'mode': 'continuous'},
+                        robot={'odometry': RELIABLE}) as (robot, _):
+        robot.drive()
+        robot.sends.discard('odom')
+        robot.wait_for_zero()
+        robot.says('odometry fell silent')
+        assert not robot.call(SetBool, 'enable', data=True).success
+
+
+def test_the_diagnostics_name_rates_and_latency(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, robot={'odometry': RELIABLE}) as (robot, _):
+        robot.drive()
+        robot.spin_for(3.0)
+        values = robot.statuses[-1][3]
+        assert 20 < float(values['frame_rate_hz']) < 40
+        assert 30 < float(values['odometry_rate_hz']) < 60
+        assert 0 < float(values['inference_ms']) < 100
+        assert float(values['frame_age_ms']) < 250
+
+
+def test_a_finalized_node_keeps_no_publisher(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path) as (robot, _):
+        wait_until(lambda: robot.node.count_publishers('cmd_vel'), robot.spin)
+        assert robot.transition(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        wait_until(lambda: not robot.node.count_publishers('cmd_vel'), robot.spin, 10)
+
+
+def test_a_listener_that_wants_history_is_named(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path) as (robot, _):
+        from fake_robot import LATCHED
+        from geometry_msgs.msg import Twist
+        robot.node.create_subscription(Twist, 'cmd_vel', lambda _: None, LATCHED)
+        robot.says('transient local', 20)
+        assert qos('cmd_vel').durability != LATCHED.durability

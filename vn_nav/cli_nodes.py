@@ -1,0 +1,33 @@
+"""Entry points of the nodes. They hear signals before the seconds of imports begin."""
+
+from __future__ import annotations
+
+import importlib
+
+from vn_nav.nodes import signals
+
+
+def _start(module: str) -> int:
+    """Import a node's module and run its `main`; the exit code."""
+    signals.exit_at_once()
+    return importlib.import_module(module).main()
+
+
+def goal_node() -> int:
+    """Show the robot a picture from a file."""
+    return _start('vn_nav.nodes.goal_node')
+
+
+def policy_node() -> int:
+    """Drive a robot to the place of a picture."""
+    return _start('vn_nav.nodes.policy_node')
+
+
+def recorder_node() -> int:
+    """Record a bag."""
+    return _start('vn_nav.nodes.recorder_node')
+
+
+def sim_bridge_node() -> int:
+    """Simulate a robot in a house."""
+    return _start('vn_sim_bridge.bridge_node')

@@ -1,0 +1,163 @@
+"""What policy_node hears: its subscriptions, and what is wrong with what comes on them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import threading
+import time
+
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import String
+
+from vn_nav.nodes.command_output import CommandOutput
+from vn_nav.nodes.decision_worker import WINDOW_S, DecisionWorker
+from vn_nav.nodes.qos import other_types, qos, subscribe
+from vn_nav.nodes.window import Window
+from vn_nav.policy.frame_gate import shorten
+from vn_nav.policy.goal_watch import GoalWatch
+from vn_nav.policy.navigator import ENABLED, Navigator
+
+CAMERA_FOV = (math.radians(5), math.radians(170))  # what a pinhole camera can have
+
+
+class PolicyInputs:
+    """Hands what comes to the worker and the output; callbacks keep the newest and return.
+
+    Args:
+        node: that subscribes.
+        navigator: judges stamps.
+        worker: takes pictures and goals.
+        output: takes odometry.
+        wake: guards the navigator.
+        compressed: pictures come on image_raw/compressed.
+        lock_step: stamps are the simulator's ticks, and nothing is late.
+        shadow: somebody else drives, and says what he did.
+
+    Attributes:
+        subscriptions: what was made.
+        odometry_topic: its resolved name.
+    """
+
+    def __init__(self, node, navigator: Navigator, worker: DecisionWorker, output: CommandOutput,
+                 wake: threading.Condition, *, compressed: bool, lock_step: bool, shadow: bool):
+        self._node, self._navigator, self._worker, self._output = node, navigator, worker, output
+        self._wake, self._lock_step = wake, lock_step
+        self._goals = GoalWatch(trust_stamps=lock_step)
+        self._frames, self._odometry = Window(WINDOW_S), Window(WINDOW_S)  # frames: their ages [s]
+        self._types: dict[str, type] = {}  # by resolved name
+        self.subscriptions: list = []
+        image, kind = (('image_raw/compressed', CompressedImage) if compressed else
+                       ('image_raw', Image))
+        self._hear(image, kind, self._on_image)
+        self._hear('camera_info', CameraInfo, self._on_camera_info)
+        self._hear('goal_image', Image, self._on_goal)
+        # In lock-step no message may be missed, and the simulator is reliable.
+        self.odometry_topic = self._hear('odom', Odometry, self._on_odometry, exact=lock_step)
+        if shadow:
+            self._hear('executed_action', String, self._on_executed_action, exact=True)
+
+    def _hear(self, name: str, kind: type, callback, *, exact: bool = False) -> str:
+        """Subscribe, as the contract says or so that any publisher is heard; the resolved name."""
+        self.subscriptions += (
+            [self._node.create_subscription(kind, name, callback, qos(name))] if exact
+            else subscribe(self._node, kind, name, callback))
+        resolved = self.subscriptions[-1].topic_name
+        self._types[resolved] = kind
+        return resolved
+
+    @property
+    def awaited(self) -> tuple[str, str, str]:
+        """Resolved names of the topics without which nothing moves: pictures, goal, odometry."""
+        image, _, goal, odometry = list(self._types)[:4]
+        return image, goal, odometry
+
+    # Callbacks, on the executor's thread.
+
+    def _on_image(self, message) -> None:
+        received = time.monotonic()
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        with self._wake:
+            # In lock-step stamps are the simulator's ticks and nothing is late; elsewhere the
+            # node's clock judges.
+            clock = None if self._lock_step else self._node.get_clock().now().nanoseconds * 1e-9
+            self._frames.add(received, 0.0 if clock is None else clock - stamp)
+            if self._navigator.admit(stamp, clock):
+                self._worker.show_frame(message, stamp, received)
+            else:
+                self._wake.notify_all()
+
+    def _on_goal(self, message: Image) -> None:
+        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        picture = (message.height, message.width, message.encoding,
+                   hashlib.blake2b(message.data, digest_size=16).digest())
+        with self._wake:
+            if self._goals.is_new(stamp, picture, time.monotonic()):
+                self._navigator.new_goal()
+                self._worker.show_goal(message)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self._odometry.add(time.monotonic())
+        self._output.take_odometry(message)
+
+    def _on_executed_action(self, message: String) -> None:
+        try:
+            told = json.loads(message.data)
+            sec, nanosec = told['stamp']
+            self._worker.tell(sec + nanosec * 1e-9, told['action'])
+        except Exception as error:  # whatever somebody writes there
+            self._node.get_logger().error(
+                "executed_action is JSON with stamp [sec, nanosec] and an action's name or null; "
+                f'received {shorten(message.data)!r}: {shorten(repr(error))}')
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        side, focal = min(message.width, message.height), message.k[0]
+        if not (side > 0 and math.isfinite(focal) and focal > 0):
+            return  # an uncalibrated camera says zero
+        fov = 2 * math.atan(side / 2 / focal)
+        if not CAMERA_FOV[0] <= fov <= CAMERA_FOV[1]:
+            least, most = map(math.degrees, CAMERA_FOV)
+            self._node.get_logger().error(
+                f'a camera sees {least:.0f} to {most:.0f} deg; camera_info says '
+                f'{math.degrees(fov):.3g}: calibrate the camera', throttle_duration_sec=10.0)
+            return
+        self._worker.set_camera_fov(fov)
+
+    # What there is to say of them.
+
+    def unheard(self) -> list[str]:
+        """Topics that are published and not heard: another type, or odometry that never comes."""
+        found = [f'{node} publishes {name} as {other}, and this node listens for {kind.__name__}: '
+                 'remap it, or republish it' for name, kind in self._types.items()
+                 for node, other in other_types(self._node, name, kind)]
+        if self._output.odometry is None and not found and (
+                self._node.count_publishers(self.odometry_topic)):
+            found.append(f'{self.odometry_topic} has a publisher, and nothing of it has come: '
+                         'check the driver and the middleware')
+        return found
+
+    def warnings(self) -> list[str]:
+        """What is wrong with the inputs though the robot may drive."""
+        warnings = self.unheard()
+        if goals := self._goals.warning(time.monotonic()):
+            warnings.append(goals)
+        if (self._output.odometry is None and not self._lock_step and not warnings
+                and self._navigator.state in ENABLED):
+            warnings.append(f'no odometry on {self.odometry_topic}: actions run on time alone')
+        return warnings
+
+    def values(self) -> dict[str, str]:
+        """Rates and latencies of the last seconds, for the diagnostics."""
+        now = time.monotonic()
+        inferences = self._worker.inferences
+        return {'frame_rate_hz': f'{self._frames.rate(now):.1f}',
+                'frame_age_ms': _milliseconds(self._frames.median(now)),
+                'inference_ms': _milliseconds(inferences.median(now)),
+                'inference_ms_max': _milliseconds(inferences.largest(now)),
+                'odometry_rate_hz': f'{self._odometry.rate(now):.1f}'}
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return 'unknown' if seconds is None else f'{1e3 * seconds:.1f}'

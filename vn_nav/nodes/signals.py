@@ -1,0 +1,82 @@
+"""What a node does at a signal, from its first import to the end of its process. No ROS here.
+
+A node has four times. While it imports, nothing exists yet: a signal ends the process at once.
+While it works, a signal is noted, and the work ends soon. Compiling cannot be interrupted halfway
+(an exception from a signal handler is lost in LLVM's callbacks): a signal lets go of the node and
+ends the process. While the process ends, further signals are ignored: a terminal and `ros2 launch`
+may both send one, and the interpreter takes its handlers away before it is gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Callable, Iterator
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
+
+
+def heard() -> list[signal.Signals]:
+    """The signals that end a node; not SIGHUP where `nohup` has it ignored."""
+    return [number for number in SIGNALS
+            if not (number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN)]
+
+
+def exit_at_once() -> None:
+    """From now on a signal ends the process with exit code 0: there is nothing to stop yet."""
+    for number in heard():
+        signal.signal(number, lambda *_: os._exit(0))
+
+
+def ignore() -> None:
+    """From now on signals do nothing: the process ends anyway."""
+    for number in heard():
+        signal.signal(number, signal.SIG_IGN)
+
+
+class Ended:
+    """Becomes true at SIGINT, SIGTERM, SIGQUIT or SIGHUP.
+
+    Not a `threading.Event`: a signal handler runs in the middle of what the main thread does, and
+    `Event.set` there waits for ever for the lock that an interrupted `Event.wait` holds.
+    """
+
+    def __init__(self):
+        self._ended = False
+        self._let_go: Callable[[], None] | None = None
+        self._before = {number: signal.signal(number, self._on_signal) for number in heard()}
+
+    def _on_signal(self, *_):
+        self._ended = True
+        if self._let_go is not None:
+            self._leave()
+
+    def _leave(self) -> None:
+        try:
+            self._let_go()
+        finally:
+            os._exit(0)
+
+    def is_set(self) -> bool:
+        """A signal has come."""
+        return self._ended
+
+    @contextlib.contextmanager
+    def leaving(self, let_go: Callable[[], None]) -> Iterator[None]:
+        """A signal calls `let_go` and ends the process with exit code 0, wherever the body is.
+
+        Also a signal that came before. For slow work that has nothing to lose.
+        """
+        self._let_go = let_go
+        try:
+            if self._ended:
+                self._leave()
+            yield
+        finally:
+            self._let_go = None
+
+    def restore(self) -> None:
+        """Leave the signals to whoever heard them before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
