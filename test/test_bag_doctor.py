@@ -13,6 +13,7 @@ from small_bags import (
     INFO,
     ODOMETRY,
     START,
+    STORE,
     STRING,
     TWIST,
     camera_info,
@@ -21,13 +22,16 @@ from small_bags import (
     odometry,
     picture,
     records,
+    serialised,
     twist,
     write,
 )
 
 from vn_nav import cli
+from vn_nav.bags.dataset import Wanted, load_drives
 from vn_nav.bags.doctor import ERROR, WARNING, diagnose
-from vn_nav.bags.drive import Topics
+from vn_nav.bags.roles import Topics, load_topics
+from vn_nav.robot import RobotSpec
 
 FAR = 60_000_000_000  # ns
 
@@ -235,3 +239,90 @@ def test_commands_alone_serve_and_a_robot_that_is_never_told_to_move_is_found(tm
     found = diagnose(write(tmp_path / 'a.mcap', sent))
     assert any(f.topic == '/cmd_vel' and 'never moves' in f.what for f in found.findings)
     assert IMAGE in {t.type for t in found.topics}
+
+
+def set_back(messages, topics, recorder=False):
+    """The messages and, behind them, others with the same stamps: a simulator that was reset."""
+    again = [(topic, kind, time if recorder else time + FAR, message)
+             for topic, kind, time, message in drive(seed=1) if topic in topics]
+    late = [] if recorder else [
+        (topic, kind, time + FAR, restamped(FAR, 0)(topic, kind, time, message)[3])
+        for topic, kind, time, message in drive(seed=2) if topic not in topics
+        and topic != '/cmd_vel']
+    return messages + sorted(again + late, key=lambda m: m[2])
+
+
+@pytest.mark.parametrize('recorder', [False, True])
+def test_a_clock_that_was_set_back_everywhere_ends_an_episode_and_is_no_error(tmp_path, recorder):
+    every = ('/image_raw', '/odom', '/camera_info', '/cmd_vel')
+    found = diagnose(write(tmp_path / 'a.mcap', set_back(drive(), every, recorder)))
+    hits = [f for f in found.findings if 'set back by' in f.what]
+    assert {f.topic for f in hits} >= {'/image_raw', '/odom'} and found.usable, found.findings
+    assert all('episode ends there' in f.remedy and f.severity == WARNING for f in hits)
+
+
+def test_a_clock_that_was_set_back_on_one_topic_alone_is_an_error(tmp_path):
+    found = diagnose(write(tmp_path / 'a.mcap', set_back(drive(), ('/odom',))))
+    assert any(f.severity == ERROR and f.topic == '/odom' and 'set back' in f.what
+               and 'chrony' in f.remedy for f in found.findings), found.findings
+
+
+@pytest.mark.parametrize('clock', ['rosgraph_msgs/msg/Clock', 'rosgraph_msgs/Clock', None])
+def test_a_pause_in_simulated_time_is_not_blamed_on_the_disk(tmp_path, clock):
+    sent = changed(drive(), '/image_raw', between(1.0, 3.0))
+    assert 'disk' in diagnose(write(tmp_path / 'a.mcap', sent)).findings[0].remedy
+    if clock:
+        sent.append(('/clock', clock, START + 5 * 10**9, make('rosgraph_msgs/msg/Clock')))
+        definition = {clock: STORE.generate_msgdef('rosgraph_msgs/msg/Clock', ros_version=2)[0]}
+        sent[-1] = (*sent[-1][:3], serialised('rosgraph_msgs/msg/Clock', sent[-1][3]))
+    else:
+        definition = None
+        for topic in ('/odom', '/image_raw', '/camera_info'):
+            sent = changed(sent, topic, restamped(-START + 10**9, 0))
+    (finding,) = diagnose(write(tmp_path / 'b.mcap', sent, definitions=definition)).findings
+    assert 'pauses' in finding.what and 'disk' not in finding.remedy
+
+
+def test_types_without_msg_are_the_same_types(tmp_path):
+    short = [(topic, kind.replace('/msg/', '/'), time, serialised(kind, message))
+             for topic, kind, time, message in drive()]
+    definitions = {kind.replace('/msg/', '/'): STORE.generate_msgdef(kind, ros_version=2)[0]
+                   for kind in (IMAGE, ODOMETRY, INFO, TWIST)}
+    path = write(tmp_path / 'a.mcap', short, definitions=definitions)
+    assert diagnose(path).findings == []
+    assert len(load_drives(path, Wanted(RobotSpec()), tmp_path / 'cache')) > 1
+
+
+def test_a_ros_1_mcap_is_named_as_such_by_every_command(tmp_path, capsys):
+    sent = [(topic, kind.replace('/msg/', '/'), time, b'') for topic, kind, time, _ in drive(1.0)]
+    path = write(tmp_path / 'a.mcap', sent, schema='ros1msg', encoding='ros1',
+                 definitions={kind: '' for _, kind, _, _ in sent})
+    (finding,) = diagnose(path).findings
+    assert finding.severity == ERROR and 'recording of ROS 1' in finding.what
+    assert 'rosbags-convert --src FILE.bag' in finding.remedy
+    for command in (['show'], ['export', '--lerobot', str(tmp_path / 'out')]):
+        assert cli.main(['bag', command[0], str(path), *command[1:]]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert 'recording of ROS 1' in line and 'rosbags-convert' in line
+
+
+@pytest.mark.parametrize('role, topic, kind', [
+    ('odometry', '/amcl_pose', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
+    ('command', '/joy', 'sensor_msgs/msg/Joy'),
+    ('depth', '/depth/compressedDepth', 'sensor_msgs/msg/CompressedImage')])
+def test_a_topic_of_another_type_is_one_error_in_every_command(
+        tmp_path, capsys, role, topic, kind):
+    sent = drive(1.0) + [(topic, kind, START + k * 10**8, bytes(64)) for k in range(5)]
+    bag, names = write(tmp_path / 'a.mcap', sent), tmp_path / 'topics.yaml'
+    names.write_text(f'{role}: {topic}\n')
+    commands = [['teach', str(bag), '--out', str(tmp_path / 'o')],
+                ['pretrain', str(bag), '--out', str(tmp_path / 'o')]]
+    if role != 'depth':  # which these do not use
+        commands += [['bag', 'show', str(bag), '--out', str(tmp_path / 'x.html')],
+                     ['bag', 'export', str(bag), '--lerobot', str(tmp_path / 'l')]]
+    for command in commands:
+        assert cli.main([*command, '--topics', str(names)]) == 2, command
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert f'the {role} of a bag is' in line and f'{topic}: {kind}' in line
+    found = diagnose(bag, topics=load_topics(names))
+    assert any(f.topic == topic and f'is {kind}, not' in f.what for f in found.findings)

@@ -32,8 +32,9 @@ from vn_nav.bags.compare_drives import (
     read_shadow,
 )
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import MISFIT, Topics, load_topics
+from vn_nav.bags.drive import MISFIT
 from vn_nav.bags.reader import read_bag
+from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.bags.shadow_plan import make_plan, stamped
 from vn_nav.bags.stream import messages
 from vn_nav.cli import main

@@ -13,8 +13,9 @@ from small_bags import FIXTURE, IMAGE, START, drive, odometry, picture, write
 
 from vn_nav.bags.agreement import END, OTHER, STOP, judge
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import MISFIT, Frame, Topics
+from vn_nav.bags.drive import MISFIT, Frame
 from vn_nav.bags.reader import read_bag
+from vn_nav.bags.roles import Topics
 from vn_nav.bags.show import show
 from vn_nav.bags.show_figures import BINS, POINTS, STRIP, Film, Odometer, Timeline, Ways
 from vn_nav.bags.show_page import _series, show_page

@@ -188,7 +188,7 @@ def test_other_formats_are_refused_with_a_remedy(tmp_path):
     for path, words in (
             (tmp_path / 'nothing', 'metadata.yaml'),
             (folder('empty'), 'metadata.yaml'),
-            (folder('sqlite', None, 'x_0.db3'), 'ros2 bag convert'),
+            (folder('sqlite', None, 'x_0.db3'), 'rosbags-convert --src'),
             (folder('ros1', None, 'x.bag'), 'rosbags-convert'),
             (folder('whole', info % ('x.mcap.zstd', 'FILE')), 'zstd -d'),
             (folder('each', info % ('x.mcap', 'MESSAGE')), 'one by one'),

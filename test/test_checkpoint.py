@@ -227,5 +227,5 @@ def test_not_finite_output_is_an_error():
 
 
 def test_every_key_has_a_type():
-    from vn_nav.policy import checkpoint
+    from vn_nav.policy import checkpoint_info as checkpoint
     assert checkpoint.INFO.keys() == checkpoint.INFO_TYPES.keys()

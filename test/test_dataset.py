@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_bags import IMAGE, START, drive, picture, write
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags import dataset
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import MISFIT, Topics
+from vn_nav.bags.drive import MISFIT
 from vn_nav.bags.reader import read_bag
+from vn_nav.bags.roles import Topics
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess, preprocess_map
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -80,7 +82,7 @@ def test_every_picture_can_be_had_too(tmp_path, drives):
 
 
 def test_a_bag_that_cannot_be_learned_from_is_refused(tmp_path):
-    with pytest.raises(UserError, match='folder with MCAP files'):
+    with pytest.raises(UserError, match='no such file or folder'):
         load_drives(tmp_path / 'nowhere', WANTED, tmp_path)
     with pytest.raises(UserError, match='--topics'):
         load_drives(BAG, dataclasses.replace(WANTED, topics=Topics(image='camera')), tmp_path)
@@ -102,3 +104,36 @@ def test_labels_are_cropped_as_pictures_are_and_never_mixed():
     assert small.shape == (84, 84) and set(np.unique(small)) <= set(np.unique(labels))
     assert (np.abs(small.astype(int) - picture) <= 1).mean() > 0.55  # but at their edges
     assert np.array_equal(preprocess_map(small, 84), small)
+
+
+@pytest.mark.parametrize('every', [True, False])
+def test_depth_in_an_encoding_that_cannot_be_read_is_left_out_and_it_says_so(tmp_path, every):
+    sent = drive(2.0)
+    beside = []
+    for k, (_, _, time, _) in enumerate([m for m in sent if m[0] == '/image_raw']):
+        depth = picture(time - 5_000_000, np.ones((32, 32), np.uint16),
+                        'mono12' if every or k < 7 else '16UC1')
+        depth.step = 64
+        beside.append(('/depth/image_raw', IMAGE, time + 1, depth))
+    goal = ('/goal_image', IMAGE, START, picture(START, np.ones((8, 8), np.uint8), 'magic8'))
+    bag = write(tmp_path / 'a.mcap', sorted([*sent, *beside, goal], key=lambda m: m[2]))
+    drives = load_drives(bag, dataclasses.replace(WANTED, every=True), tmp_path / 'cache')
+    assert len(drives) == 20 and drives.depth is None and drives.facts['undecodable'] == 0
+    words, about_goal = drives.facts['notes']
+    assert words.startswith(f'depth left out: {20 if every else 7} of 20 cannot be read')
+    assert 'mono12' in words and about_goal == '1 goal picture cannot be decoded'
+
+
+def test_a_simulator_that_was_reset_while_recording_gives_two_episodes_and_every_picture(tmp_path):
+    """On its own clock, recorded by the wall's, or by its own too: what a bag can hold of it."""
+    for shift in (0, 5 * 10**9):
+        again = [(topic, kind, time + shift, message)
+                 for topic, kind, time, message in drive(4.0, seed=1)]
+        bag = write(tmp_path / f'{shift}.mcap', drive(4.0) + again)
+        drives = load_drives(bag, dataclasses.replace(WANTED, every=True), tmp_path / 'cache')
+        assert len(drives) == 80 and [len(drives.time[k]) for k in drives.episodes()] == [40, 40]
+        assert drives.facts['set_back'] == 1 and drives.facts['unordered'] == 0
+        assert np.allclose(drives.pose[:40], drives.pose[40:], atol=1e-6)
+        split = write(tmp_path / f'{shift}b.mcap', drive(4.0) + again, chunked=False)
+        whole = load_drives(split, dataclasses.replace(WANTED, every=True), tmp_path / 'cache')
+        assert np.array_equal(whole.image, drives.image)

@@ -12,17 +12,25 @@ from vn_nav.bags.drive import (
     Cutter,
     Heard,
     Report,
-    Topics,
     integrate,
-    load_topics,
     synchronise,
 )
+from vn_nav.bags.roles import TYPES, Topics, full_name, load_topics
+from vn_nav.bags.stamped import Stamped
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
-TOPICS = Topics().within(['/image_raw', '/odom', '/cmd_vel', '/goal_image', '/depth/image_raw',
-                          '/episode_end'])
+ROLES = {'/image_raw': 'image', '/odom': 'odometry', '/cmd_vel': 'command',
+         '/goal_image': 'goal', '/depth/image_raw': 'depth', '/episode_end': 'episode_end'}
+
+
+def typed(**roles):
+    """Topics by role, with a type that each may have."""
+    return {name: TYPES[role][0] for role, name in roles.items()}
+
+
+TOPICS = Topics().within({name: TYPES[role][0] for name, role in ROLES.items()})
 
 
 def header(stamp):
@@ -150,7 +158,7 @@ def test_episodes_end_where_they_are_said_to_where_the_goal_changes_and_at_gaps_
 
 
 def test_velocities_stand_in_for_odometry_and_are_not_believed_for_ever():
-    topics = Topics().within(['/image_raw', '/cmd_vel'])
+    topics = Topics().within(typed(image='/image_raw', command='/cmd_vel'))
     assert topics.odometry == ''
     messages = [Heard('/cmd_vel', twist(0.4, 0.0), t) for t in np.arange(1.0, 2.0, 0.1)]
     messages += [Heard('/cmd_vel', twist(math.nan, 0.0), 1.55)]
@@ -196,15 +204,17 @@ def test_a_robot_that_stands_still_gives_one_frame_an_episode():
 
 
 def test_topics_are_found_by_role_and_renamed_by_a_file(tmp_path):
-    assert Topics().within(['image_raw/compressed', 'odom']).image == 'image_raw/compressed'
+    names = typed(image='image_raw/compressed', odometry='odom')
+    assert Topics().within(names).image == 'image_raw/compressed'
     path = tmp_path / 'topics.yaml'
     path.write_text('image: /camera/color/image_raw\nodometry: /base/odom\n')
-    found = load_topics(path).within(['/camera/color/image_raw/compressed', '/base/odom'])
+    found = load_topics(path).within(typed(image='/camera/color/image_raw/compressed',
+                                           odometry='/base/odom'))
     assert found.image == '/camera/color/image_raw/compressed' and found.odometry == '/base/odom'
     with pytest.raises(UserError, match='image_raw'):
-        Topics().within(['/odom'])
+        Topics().within(typed(odometry='/odom'))
     with pytest.raises(UserError, match='odometry or command'):
-        Topics().within(['/image_raw'])
+        Topics().within(typed(image='/image_raw'))
     for text in ('picture: /a', 'image: 3', '- a', ': :', 'image: "/"'):
         path.write_text(text)
         with pytest.raises(UserError, match='topics'):
@@ -222,3 +232,121 @@ def test_what_is_held_is_bounded_when_odometry_ends():
             ahead.append(report.pictures - report.without_pose)
     list(synchronise(watched(), TOPICS, report))
     assert max(ahead) <= 15 and report.without_pose > 500
+
+
+def reset(first, second, *, odometry_rate=50.0, offset=100.0):
+    """A drive, and behind it another whose stamps begin anew: a simulator that was reset."""
+    one, _ = drive(first, start=10.0, odometry_rate=odometry_rate)
+    other, _ = drive(second, start=10.0, odometry_rate=odometry_rate, offset=offset)
+    return one, other
+
+
+def test_a_clock_that_was_set_back_begins_an_episode_and_no_picture_is_lost():
+    one, other = reset([(0.3, 0.0, 4.0)], [(0.3, 0.5, 2.0)], offset=4.3)
+    count = sum(m.topic == '/image_raw' for m in one + other)
+    frames, report = frames_of(one + other)
+    assert len(frames) == report.pictures == count == 180
+    assert report.set_back == 1 and report.unordered == report.without_pose == report.jumps == 0
+    assert [f.episode for f in frames] == [0] * 120 + [1] * 60
+    # The poses are those of each take, to the last picture before and the first one behind.
+    assert frames[119].pose[0] == pytest.approx(0.3 * (119 / 30), abs=0.01)
+    assert abs(frames[120].pose[0]) < 0.01 and frames[179].pose[2] == pytest.approx(0.98, abs=0.03)
+
+
+@pytest.mark.parametrize('later', ['/odom', '/image_raw'])
+def test_a_topic_may_come_late_to_the_new_clock(later):
+    """Around a reset the one topic is already of the new clock, the other still of the old."""
+    one, other = reset([(0.3, 0.0, 4.0)], [(0.3, 0.0, 4.0)], offset=4.3)
+    moved = sorted((m._replace(time=m.time + 0.35) if m.topic == later else m
+                    for m in one + other), key=lambda heard: heard.time)
+    frames, report = frames_of(moved)
+    assert len(frames) == 240 and report.set_back == 1 and report.episodes == 2
+
+
+@pytest.mark.parametrize('back', [1.5, 3.0])
+def test_takes_whose_stamps_overlap_keep_their_own_poses(back):
+    """A reset by little: two poses with the same stamps are remembered at once."""
+    one, _ = drive([(0.3, 0.0, 4.0)], start=10.0)
+    other, _ = drive([(0.0, 0.0, 4.0)], start=14.0 - back, offset=back + 0.3)
+    frames, report = frames_of(one + other)
+    assert len(frames) == 240 and report.set_back == 1
+    assert max(abs(f.pose[0]) for f in frames if f.episode == 1) < 1e-6
+    assert min(f.pose[0] - 0.3 * (f.stamp - 10.0) for f in frames if f.episode == 0) > -0.01
+
+
+def test_depth_obeys_the_same_clock():
+    one, other = reset([(0.3, 0.0, 3.0)], [(0.3, 0.0, 3.0)], offset=3.3)
+    depths = [Heard('/depth/image_raw', m.message, m.time + 0.02)
+              for m in one + other if m.topic == '/image_raw']
+    frames, _ = frames_of(sorted(one + other + depths, key=lambda heard: heard.time))
+    assert len(frames) == 180 and all(f.depth is f.image for f in frames)
+
+
+def test_one_stray_stamp_costs_no_more_than_itself():
+    for topic in ('/odom', '/image_raw'):
+        for by in (-5.0, 5.0):
+            messages, _ = drive([(0.3, 0.0, 4.0)])
+            at = next(k for k, m in enumerate(messages) if m.topic == topic and m.time > 12.0)
+            stamp = messages[at].message.header.stamp
+            stamp.sec += int(by)
+            frames, report = frames_of(messages)
+            assert len(frames) >= 119 and report.episodes == 1, (topic, by)
+
+
+def test_the_clock_of_the_recorder_may_be_set_back_too():
+    """Recorded on simulated time; with odometry, and with commands in its place."""
+    one, other = reset([(0.3, 0.0, 4.0)], [(0.3, 0.0, 3.0)], offset=0.0)
+    frames, report = frames_of(one + other)
+    assert len(frames) == 210 and report.set_back == 1 and report.episodes == 2
+    topics = Topics().within(typed(image='/image_raw', command='/cmd_vel'))
+    takes = [Heard(topic, message, t) for start, stop in ((1.0, 4.0), (1.0, 3.0))
+             for t in np.arange(start, stop, 0.1)
+             for topic, message in (('/cmd_vel', twist(0.4, 0.0)), ('/image_raw', picture(t)))]
+    frames, report = frames_of(takes, topics)
+    assert len(frames) == 50 and report.set_back == 1
+    assert frames[-1].pose[0] == pytest.approx(0.4 * (2.9 + 1.9), abs=0.01)
+
+
+def test_what_is_held_of_depth_is_bounded():
+    rows = Stamped()
+    for take in range(5):
+        for t in np.arange(0.0, 20.0, 0.05):
+            rows.hear(t, 30.0 * take + t, None)
+            assert sum(len(run.stamps) for run in rows._runs) <= 3 * 41
+
+
+def test_a_repeated_picture_is_left_out_in_later_episodes_too():
+    messages, _ = drive([(0.3, 0.0, 6.0)])
+    quiet = [m for m in messages if m.topic == '/odom' or not 11.0 < m.time < 12.5]
+    last = [m for m in quiet if m.topic == '/image_raw'][-1]
+    frames, report = frames_of([*quiet, last._replace(time=last.time + 0.01)])
+    assert report.episodes == 2 and report.unordered == 1
+
+
+@pytest.mark.parametrize('role, kind', [
+    ('image', 'sensor_msgs/msg/PointCloud2'), ('odometry', 'geometry_msgs/msg/PoseStamped'),
+    ('command', 'sensor_msgs/msg/Joy'), ('goal', 'geometry_msgs/msg/PoseStamped'),
+    ('depth', 'sensor_msgs/msg/CompressedImage'), ('labels', 'std_msgs/msg/String'),
+    ('episode_end', 'std_msgs/msg/Bool'), ('camera_info', 'std_msgs/msg/String'),
+    ('odometry', ''), ('odometry', 'nav_msgs/msg/Odometry and std_msgs/msg/String')])
+def test_a_role_whose_topic_has_another_type_is_refused_with_one_that_has_it(role, kind):
+    names = {known: f'/{known}' for known in TYPES}
+    held = typed(**names) | {f'/{role}': kind}
+    with pytest.raises(UserError, match=f'the {role} of a bag is') as error:
+        Topics(**names).within(held)
+    assert f"'/{role}: {kind or 'no type'}'" in str(error.value)
+    if role not in ('image', 'odometry', 'command', 'goal'):
+        assert f'{role}: null' in error.value.remedy
+    with pytest.raises(UserError) as error:
+        Topics(**names).within(held | {'/other': TYPES[role][0]})
+    assert '/other' in error.value.remedy and '--topics' in error.value.remedy
+
+
+def test_types_without_msg_are_the_same_types_and_a_role_can_be_left_out(tmp_path):
+    assert full_name('nav_msgs/Odometry') == full_name('nav_msgs/msg/Odometry')
+    assert Topics().within({'/image_raw': 'sensor_msgs/Image',
+                            '/odom': 'nav_msgs/Odometry'}).odometry == '/odom'
+    path = tmp_path / 'topics.yaml'
+    path.write_text('depth: null\n')
+    held = typed(image='/image_raw', odometry='/odom') | {'/depth/image_raw': 'std_msgs/msg/Int8'}
+    assert load_topics(path).within(held).depth == ''

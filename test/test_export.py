@@ -10,7 +10,8 @@ import torch
 from vn_nav import cli
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.checkpoint import INFO, LoadedCheckpoint, save_checkpoint
+from vn_nav.policy.checkpoint import LoadedCheckpoint, save_checkpoint
+from vn_nav.policy.checkpoint_info import INFO
 from vn_nav.policy.export import OPSET, export_onnx
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec

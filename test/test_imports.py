@@ -120,3 +120,34 @@ def test_the_rest_imports_without_ros(tmp_path):
         env={**os.environ, 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'})
     assert result.returncode == 0, result.stdout + result.stderr
     assert f'imported {len(names)}' in result.stdout
+
+
+LIGHT = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] in ('torch', 'numba', 'llvmlite', 'onnx', 'scipy'):
+            raise ModuleNotFoundError(f'No module named {name!r} (blocked)', name=name)
+
+sys.meta_path.insert(0, Absent())
+from vn_nav import cli
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('words', [
+    ['bag', '--help'], ['--version'], ['--help'],
+    ['bag', 'doctor', 'BAG', '--checkpoint', 'models/house'], ['bag', 'recover', 'BAG', 'OUT'],
+    ['bag', 'show', 'BAG', '--out', 'OUT'], ['bag', 'export', 'BAG', '--lerobot', 'OUT']],
+    ids=' '.join)
+def test_a_look_into_a_bag_takes_neither_torch_nor_numba_nor_a_gigabyte(tmp_path, words):
+    if 'export' in words and importlib.util.find_spec('pyarrow') is None:
+        pytest.skip('expected: pyarrow is an extra')
+    places = {'BAG': str(ROOT / 'bags' / 'house_drive'), 'OUT': str(tmp_path / 'out')}
+    done = subprocess.run(
+        [sys.executable, '-c', LIGHT, *(places.get(word, word) for word in words)], cwd=ROOT,
+        capture_output=True, text=True, env={**os.environ, 'OPENBLAS_NUM_THREADS': '1'})
+    assert done.returncode == 0, done.stdout + done.stderr

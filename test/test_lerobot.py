@@ -8,10 +8,10 @@ import pytest
 from small_bags import FIXTURE, IMAGE, START, TWIST, odometry, picture, twist, write
 
 from vn_msgs_py.images import decode_rgb
-from vn_nav.bags.drive import Topics
 from vn_nav.bags.lerobot import ACTION, CAMERA, FIRST, STATE, export
 from vn_nav.bags.lerobot_stats import Colours, describe, merge
 from vn_nav.bags.reader import read_bag
+from vn_nav.bags.roles import Topics
 from vn_nav.cli import main
 from vn_nav.errors import UserError
 

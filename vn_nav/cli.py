@@ -12,23 +12,17 @@ from pathlib import Path
 
 from vn_nav import __version__
 from vn_nav.bags.command import add_bag_commands
-from vn_nav.cli_evaluate import run_evaluate, run_publish
 from vn_nav.cli_world import add_world, check_backend, load_for_house, machine, make_env
 from vn_nav.errors import UserError
-from vn_nav.evaluation.command import add_compare_options, add_evaluate_options, run_compare
-from vn_nav.learning.command import (
-    add_train_options,
-    check_train_options,
-    config_over_ros,
-    train_config,
-    world_options,
-)
-from vn_nav.learning.pretrain_command import add_pretrain_options, run_pretrain
-from vn_nav.learning.teach import add_teach_options, teach
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The command line."""
+def build_parser(command: str | None = None) -> argparse.ArgumentParser:
+    """The command line.
+
+    Args:
+        command: whose options are wanted; None: all. Those of training take torch along, which
+            a look into a bag must not wait for.
+    """
     parser = argparse.ArgumentParser(
         prog='vn_nav', description='Visual navigation for ROS 2: show a robot a picture, and it '
         'drives to where the picture was taken.')
@@ -43,8 +37,10 @@ def build_parser() -> argparse.ArgumentParser:
     demo.set_defaults(run=run_demo)
 
     train = commands.add_parser('train', help='train a policy')
-    add_world(train)
-    add_train_options(train)
+    if command in (None, 'train'):
+        from vn_nav.learning.command import add_train_options
+        add_world(train)
+        add_train_options(train)
     train.set_defaults(run=run_train)
 
     collected = commands.add_parser(
@@ -59,23 +55,32 @@ def build_parser() -> argparse.ArgumentParser:
     collected.set_defaults(run=run_collect)
 
     pretrained = commands.add_parser('pretrain', help='pre-train a policy on recorded bags')
-    add_pretrain_options(pretrained)
-    pretrained.set_defaults(run=run_pretrain)
+    if command in (None, 'pretrain'):
+        from vn_nav.learning.pretrain_command import add_pretrain_options, run_pretrain
+        add_pretrain_options(pretrained)
+        pretrained.set_defaults(run=run_pretrain)
 
     taught = commands.add_parser(
         'teach', help='learn the place where a bag was driven, in its pictures')
-    add_teach_options(taught)
+    if command in (None, 'teach'):
+        from vn_nav.learning.teach import add_teach_options
+        add_teach_options(taught)
     taught.set_defaults(run=run_teach)
 
     measured = commands.add_parser('evaluate', help='measure a checkpoint')
-    measured.add_argument('checkpoint', type=Path)
-    add_world(measured, defaults=False)
-    add_evaluate_options(measured)
-    measured.set_defaults(run=run_evaluate)
+    if command in (None, 'evaluate'):
+        from vn_nav.cli_evaluate import run_evaluate
+        from vn_nav.evaluation.command import add_evaluate_options
+        measured.add_argument('checkpoint', type=Path)
+        add_world(measured, defaults=False)
+        add_evaluate_options(measured)
+        measured.set_defaults(run=run_evaluate)
 
     compare = commands.add_parser('compare', help="plot several runs' learning curves")
-    add_compare_options(compare)
-    compare.set_defaults(run=run_compare)
+    if command in (None, 'compare'):
+        from vn_nav.evaluation.command import add_compare_options, run_compare
+        add_compare_options(compare)
+        compare.set_defaults(run=run_compare)
 
     publish = commands.add_parser(
         'publish', help='measure a run and write it as a checkpoint to ship')
@@ -140,6 +145,7 @@ def run_collect(args) -> int:
 
 def run_train(args) -> int:
     """`vn_nav train`."""
+    from vn_nav.learning.command import check_train_options, train_config, world_options
     check_backend(args.backend)
     check_train_options(args)
     if args.env == 'ros':
@@ -188,7 +194,7 @@ def _bag_mix(args, config, robot):
     """The bags that a training learns from as well; None: there are none."""
     if not args.bags:
         return None
-    from vn_nav.bags.drive import Topics, load_topics
+    from vn_nav.bags.roles import Topics, load_topics
     from vn_nav.learning.bag_mix import BagMix
     from vn_nav.learning.pretrain_command import load_bags
     drives, _ = load_bags(args.bags, robot, args.size,
@@ -205,6 +211,7 @@ def _train_over_ros(args) -> int:
     """`vn_nav train --env ros`."""
     import torch
 
+    from vn_nav.learning.command import config_over_ros, train_config, world_options
     from vn_nav.learning.trainer import train
     from vn_nav.robot import RobotSpec, load_robot
     try:
@@ -256,6 +263,7 @@ def _pair_sources(args, config):
 
 def run_teach(args) -> int:
     """`vn_nav teach`."""
+    from vn_nav.learning.teach import teach
     from vn_sim_bridge import teach as place
     return teach(args, place)
 
@@ -267,6 +275,12 @@ def run_export(args) -> int:
     for path in export_onnx(load_checkpoint(args.checkpoint), args.onnx):
         print(f'{path}: {path.stat().st_size / 1e6:.1f} MB')
     return 0
+
+
+def run_publish(args) -> int:
+    """`vn_nav publish`."""
+    from vn_nav import cli_evaluate
+    return cli_evaluate.run_publish(args)
 
 
 def run_demo(args) -> int:
@@ -319,7 +333,10 @@ def run_house_export(args) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point: 2 and one line on standard error for bad input."""
-    args = build_parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    # The first word that is no option is the command: no option before it takes a value.
+    command = next((word for word in words if not word.startswith('-')), '')
+    args = build_parser(command).parse_args(words)
     try:
         return args.run(args)
     except UserError as error:

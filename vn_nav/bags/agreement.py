@@ -11,16 +11,17 @@ import dataclasses
 import math
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
 
 from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import MISFIT, Topics
-from vn_nav.policy.checkpoint import LoadedCheckpoint
-from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.roles import Topics
 from vn_nav.robot import RobotSpec
+
+if TYPE_CHECKING:  # it takes torch along
+    from vn_nav.policy.checkpoint import LoadedCheckpoint
 
 LISTED = 300  # steps that are told one by one, at most
 SHOWN = 8  # disagreements with their pictures
@@ -95,6 +96,7 @@ def judge(bag: str | Path, checkpoint: LoadedCheckpoint, robot: RobotSpec, topic
 
 
 def _judge(drives: DriveSet, checkpoint: LoadedCheckpoint) -> Agreement:
+    import torch
     torch.set_num_threads(1)
     actions = checkpoint.config.actions
     threshold = checkpoint.info['stop_threshold']
@@ -122,6 +124,9 @@ def _judge(drives: DriveSet, checkpoint: LoadedCheckpoint) -> Agreement:
 def _episode(drives: DriveSet, steps: slice, goal: np.ndarray, checkpoint: LoadedCheckpoint,
              threshold: float | None):
     """The policy's word on each step of an episode."""
+    import torch
+
+    from vn_nav.policy.runtime import BatchedPolicy
     policy, actions = BatchedPolicy(checkpoint.network, 1, 'greedy'), checkpoint.config.actions
     goals, before = np.array(goal)[None], MISFIT
     for row in range(steps.start, steps.stop):

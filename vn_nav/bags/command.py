@@ -75,7 +75,7 @@ def _add_drive(parser: argparse.ArgumentParser) -> None:
 def run_doctor(args) -> int:
     """`vn_nav bag doctor`: 0 where the bag can be used, 1 where it cannot."""
     from vn_nav.bags.doctor import diagnose
-    from vn_nav.bags.drive import load_topics
+    from vn_nav.bags.roles import load_topics
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise UserError('a file is written into a folder that exists', str(args.json),
                         'make the folder, or choose another place')
@@ -104,14 +104,16 @@ def run_show(args) -> int:
     """`vn_nav bag show`."""
     from vn_nav.bags.show import show
     from vn_nav.bags.show_page import show_page
-    from vn_nav.policy.checkpoint import load_checkpoint, write_file
+    from vn_nav.files import write_file
     from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
     if not args.out.absolute().parent.is_dir():
         raise UserError('a file is written into a folder that exists', str(args.out),
                         'make the folder, or choose another --out')
     robot = load_robot(args.robot) if args.robot else RobotSpec()
-    checkpoint = load_checkpoint(args.checkpoint) if args.checkpoint else None
-    if checkpoint is not None:
+    checkpoint = None
+    if args.checkpoint:
+        from vn_nav.policy.checkpoint import load_checkpoint
+        checkpoint = load_checkpoint(args.checkpoint)
         robot = robot.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     elif args.robot is None:
         robot = robot.with_actions(DRIVE_ACTIONS)
@@ -144,15 +146,15 @@ def run_drive(args) -> int:
 
 
 def _topics(path: Path | None):
-    from vn_nav.bags.drive import Topics, load_topics
+    from vn_nav.bags.roles import Topics, load_topics
     return load_topics(path) if path else Topics()
 
 
 def _field_of_view(checkpoint: Path | None, robot: Path | None) -> float | None:
     """What the camera has to see [rad]; None: nobody has said."""
     if checkpoint is not None:
-        from vn_nav.policy.checkpoint import load_checkpoint
-        return math.radians(load_checkpoint(checkpoint).info['camera_fov_deg'])
+        from vn_nav.policy.checkpoint_info import read_config
+        return math.radians(read_config(checkpoint)[1]['camera_fov_deg'])
     if robot is not None:
         from vn_nav.robot import load_robot
         return load_robot(robot).camera_fov

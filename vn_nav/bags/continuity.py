@@ -15,7 +15,8 @@ import numpy as np
 
 from vn_msgs_py.motion import MotionError, odometry_to_array
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.drive import JUMP, JUMP_SPEED, WAIT
+from vn_nav.bags.drive import JUMP, JUMP_SPEED
+from vn_nav.bags.stamped import WAIT, set_back
 from vn_nav.bags.stream import messages
 
 # Beside JUMP and JUMP_SPEED: faster turns than any robot's, and what a correction may do at once.
@@ -44,14 +45,14 @@ class Stretches(NamedTuple):
 def find_breaks(bag: str | Path, topic: str) -> list[Break]:
     """The breaks of the odometry on a topic of a bag, in the order of recording."""
     found, last, frame = [], None, ''
-    for message in messages(bag, (topic,)):
+    for message in messages(bag, (topic,), clocks=(topic,)):
         try:
             values = odometry_to_array(message.message)
         except MotionError:
             continue
         stamp, name = values[6] or message.time, message.message.header.frame_id.strip('/')
         if last is not None:
-            back = last[3] - stamp >= WAIT
+            back = set_back(stamp, last[3])
             if stamp <= last[3] and not back and name == frame:
                 continue  # late or repeated
             reason = _reason(last, np.append(values[:3], stamp), frame, name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -17,13 +18,15 @@ from typing import Any
 import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
-from vn_nav.bags.drive import MISFIT, Cutter, Heard, Report, Step, Topics, synchronise
+from vn_nav.bags.bag_files import files_of
+from vn_nav.bags.drive import MISFIT, Cutter, Frame, Report, Step, find_topics, hear, synchronise
+from vn_nav.bags.roles import Topics
 from vn_nav.bags.stream import messages, summary
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
 from vn_nav.robot import RobotSpec
 
-FORMAT = 1  # of the files; another one is decoded anew
+FORMAT = 2  # of the files; another one is decoded anew
 INDEX = 'index.json'
 MAX_DEPTH = 10.0  # m, stored as 255; 0: unknown
 IN_FLIGHT = 64  # pictures on their way through the decoders: memory is bounded by this
@@ -133,14 +136,11 @@ def read_steps(bag: str | Path, wanted: Wanted, report: Report) -> tuple[Iterato
         The steps; and `topics` (as they are in the bag) and `fov` (rad, of the shorter side;
         None: the bag has no camera_info).
     """
-    held = summary(bag)
-    topics = wanted.topics.within(held)
+    topics = find_topics(bag, wanted.topics)
     fov = _field_of_view(bag, topics.camera_info)
     if fov is not None:
         crop_fraction(fov, wanted.robot.camera_fov)  # or says that the camera is too narrow
-    names = tuple(filter(None, dataclasses.astuple(topics)))
-    heard = (Heard(m.topic, m.message, m.time) for m in messages(bag, names))
-    frames = synchronise(heard, topics, report)
+    frames = synchronise(hear(bag, topics), topics, report)
     steps = (_each(frames) if wanted.every else Cutter(wanted.robot, report).cut(frames))
     return steps, {'topics': dataclasses.asdict(topics), 'fov': fov}
 
@@ -151,19 +151,21 @@ def _each(frames) -> Iterator[Step]:
 
 
 def _pictures(frame, wanted: Wanted, fov: float | None) -> dict[str, np.ndarray] | None:
-    """What the arrays of a step hold of pictures."""
+    """What the arrays of a step hold of pictures; depth and labels only if they can be read."""
     lens = {} if fov is None else {'fov': fov, 'target_fov': wanted.robot.camera_fov}
     try:
         smallest = needed_side(wanted.size, **lens)
         shown = {'image': preprocess(decode_rgb(frame.image, smallest), wanted.size, **lens)}
+    except ImageError:
+        return None
+    with contextlib.suppress(ImageError):
         if frame.depth is not None:
             depth = preprocess_map(decode_depth(frame.depth), wanted.size, **lens)
             shown['depth'] = np.where(np.isfinite(depth), np.clip(
                 np.nan_to_num(depth) * (255 / MAX_DEPTH), 1, 255), 0).astype(np.uint8)
+    with contextlib.suppress(ImageError):
         if frame.labels is not None:
             shown['labels'] = preprocess_map(decode_labels(frame.labels), wanted.size, **lens)
-    except ImageError:
-        return None
     return shown
 
 
@@ -208,8 +210,9 @@ class _Columns:
 def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], None]) -> None:
     report, columns = Report(), _Columns(folder)
     steps, facts = read_steps(bag, wanted, report)
+    beside = {name: _Beside(name) for name in ('depth', 'labels') if facts['topics'][name]}
     goals: dict[bytes, int] = {}
-    shown_goal, number, bad, rows = None, -1, 0, []
+    shown_goal, number, bad, unseen, rows = None, -1, 0, 0, []
     held = summary(bag)[facts['topics']['image']].count or math.inf
     for step, pictures in decoded(steps, wanted, facts['fov']):
         show(report.pictures / held)
@@ -222,13 +225,13 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
         if frame.goal is not shown_goal:
             shown_goal = frame.goal
             number = _keep_goal(shown_goal, wanted, facts['fov'], columns, goals)
+            unseen += number < 0 and shown_goal is not None
         rows.append([frame.stamp, step.action, frame.episode, number, *frame.pose])
         columns.append('image', pictures['image'])
-        for name in ('depth', 'labels'):
-            missing = pictures.get(name)
-            if facts['topics'][name]:
-                empty = np.zeros((wanted.size, wanted.size), np.uint8)
-                columns.append(name, empty if missing is None else missing.astype(np.uint8))
+        for name, counted in beside.items():
+            counted.look(frame, pictures)
+            missing = np.zeros((wanted.size, wanted.size), np.uint8)
+            columns.append(name, pictures.get(name, missing).astype(np.uint8))
         columns.append('beside', np.array(['depth' in pictures, 'labels' in pictures]))
     if not rows:
         raise UserError('a bag to learn from holds pictures with poses beside them',
@@ -238,11 +241,45 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
     facts |= {
         'bag': str(bag), 'pictures': report.pictures, 'without_pose': report.without_pose,
         'unordered': report.unordered, 'undecodable': bad, 'bad_motion': report.bad,
-        'jumps': report.jumps, 'episodes': report.episodes, 'misfits': report.misfits,
-        'misfit_share': report.misfit_share,
+        'jumps': report.jumps, 'set_back': report.set_back, 'episodes': report.episodes,
+        'misfits': report.misfits, 'misfit_share': report.misfit_share,
         'actions': {wanted.robot.action_names[k]: n for k, n in sorted(report.actions.items())}}
+    facts['notes'] = [words for counted in beside.values() if (words := counted.words())]
+    if unseen:
+        facts['notes'].append(f'{unseen} goal picture{"s" * (unseen > 1)} cannot be decoded')
     index = {'format': FORMAT, 'columns': columns.close(), 'facts': facts}
     (folder / INDEX).write_text(json.dumps(index, indent=1))
+
+
+class _Beside:
+    """Pictures of depth or of labels beside those of the camera, and why some are not there."""
+
+    def __init__(self, role: str):
+        self._role, self._decode = role, decode_depth if role == 'depth' else decode_labels
+        self._all = self._missing = self._unreadable = 0
+        self._why = ''
+
+    def look(self, frame: Frame, pictures: dict[str, np.ndarray]) -> None:
+        self._all += 1
+        message = getattr(frame, self._role)
+        self._missing += message is None
+        if message is None or self._role in pictures:
+            return
+        self._unreadable += 1
+        if not self._why:
+            try:
+                self._decode(message)
+            except ImageError as error:
+                self._why = str(error)
+
+    def words(self) -> str:
+        """That they are left out, and why; empty: they are all there."""
+        faults = []
+        if self._missing:
+            faults.append(f'{self._missing:,} of {self._all:,} pictures have none within 50 ms')
+        if self._unreadable:
+            faults.append(f'{self._unreadable:,} of {self._all:,} cannot be read: {self._why}')
+        return f'{self._role} left out: {"; ".join(faults)}' if faults else ''
 
 
 def _keep_goal(message: Any, wanted: Wanted, fov: float | None, columns: _Columns,
@@ -282,11 +319,12 @@ def _open(folder: Path) -> DriveSet:
 
 
 def _key(bag: Path, wanted: Wanted) -> str:
-    """Of a bag as it is now, and of what to make of it."""
-    files = sorted(bag.glob('*.mcap')) if bag.is_dir() else [bag]
-    if not files or not all(path.is_file() for path in files):
-        raise UserError('a bag is a folder with MCAP files, or one such file', str(bag),
-                        'give the path of a recording')
+    """Of a bag as it is now, and of what to make of it.
+
+    Raises:
+        BagError: no bag, or one that cannot be read whole.
+    """
+    files = files_of(bag).paths
     digest = hashlib.sha256(repr((
         FORMAT, [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files],
         str(bag.resolve()), wanted.robot.moves, wanted.robot.camera_fov, wanted.size,

@@ -8,6 +8,7 @@ becomes objects.
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import Nodetype
@@ -16,7 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from vn_nav.bags.bag_files import OtherFormat, converted
 from vn_nav.bags.mcap_records import BagError, Connection, Message
+from vn_nav.bags.roles import full_name
 
 MAX_DEFINITION = 256 << 10  # bytes; the longest of Jazzy and MoveIt have about 100 kB
 MAX_UNROLLED = 4096  # elements of a fixed array for which code is generated one by one
@@ -36,6 +39,10 @@ class _Kind(NamedTuple):
     name: str
     limit: int  # bytes of a message
     stamped: bool  # it begins with a std_msgs/Header
+
+
+class Ros1(OtherFormat):
+    """A recording of ROS 1 in an MCAP file."""
 
 
 class _Unusable(Exception):
@@ -65,7 +72,8 @@ class Decoder:
         except Exception as error:  # generated code: no end to how bytes can make it fail
             if message.data[:4] == ZSTD:
                 raise _bad(message.connection, 'the messages are compressed one by one',
-                           _CONVERT) from error
+                           'convert the folder, with the metadata.yaml that says so, with '
+                           f'{converted(message.connection.path.parent)}') from error
             raise _bad(message.connection, f'a message recorded at {message.log_time} ns is none: '
                        f'{error or type(error).__name__}') from error
 
@@ -76,6 +84,11 @@ class Decoder:
             BagError: they cannot be.
         """
         if connection not in self._kinds:
+            if connection.encoding == 'ros1' or connection.schema_encoding == 'ros1msg':
+                raise Ros1(connection.path, f'a recording of ROS 1 (topic {connection.topic}: '
+                           f'{connection.type}, encoding {connection.encoding})', 'convert the '
+                           f'.bag it was made of with {converted(Path("FILE.bag"))}, which reads '
+                           'no MCAP file of ROS 1')
             if connection.encoding != 'cdr':
                 raise _bad(connection, f'its messages are {connection.encoding!r}, not cdr')
             try:
@@ -94,9 +107,6 @@ class Decoder:
                 + int.from_bytes(message.data[8:12], order))
 
 
-_CONVERT = 'write the bag anew with `ros2 bag convert`, compression_mode storage or none'
-
-
 def _bad(connection: Connection, fault: str, remedy: str = '') -> BagError:
     return BagError(connection.path, f'topic {connection.topic} ({connection.type}): {fault}',
                     rule='a message is read by its definition', remedy=remedy or 'leave the topic '
@@ -111,6 +121,7 @@ def _jazzy() -> Typestore:
 @functools.lru_cache(64)
 def _learn(name: str, encoding: str, definition: bytes) -> _Kind:
     known = _jazzy()
+    name = full_name(name)
     if not definition and name in known.fielddefs:  # recorded where the package had none
         return _kind(known, name)
     if encoding != 'ros2msg':

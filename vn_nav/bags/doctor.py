@@ -14,8 +14,9 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
-from vn_nav.bags.decoding import Decoder
+from vn_nav.bags.decoding import Decoder, Ros1
 from vn_nav.bags.doctor_figures import (
+    BACK,
     ERROR,
     WARNING,
     Command,
@@ -25,7 +26,8 @@ from vn_nav.bags.doctor_figures import (
     Motion,
     Neighbours,
 )
-from vn_nav.bags.drive import GAP, WINDOW, Topics
+from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy
+from vn_nav.bags.stamped import GAP, WINDOW
 from vn_nav.bags.stream import UNLISTED, Bag, BagError, Connection, Message
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction
@@ -40,12 +42,6 @@ SKEW = 500_000_000  # ns by which two sensors' stamps may lag behind differently
 SIMULATED = 10**17  # ns (three years): stamps so far from the recorder's time are a simulation's
 MOST_ALONE = 0.05  # share of pictures that may be without a pose beside them
 TOLD = 5  # places of damage that are told one by one
-IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-TYPES = {  # of each role of `Topics`
-    'image': (IMAGE, COMPRESSED), 'goal': (IMAGE, COMPRESSED), 'depth': (IMAGE,),
-    'labels': (IMAGE,), 'odometry': ('nav_msgs/msg/Odometry',),
-    'command': ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'),
-    'camera_info': ('sensor_msgs/msg/CameraInfo',), 'episode_end': ('std_msgs/msg/UInt8',)}
 STAMPED = ('image', 'depth', 'labels', 'odometry')  # roles that are put together by their stamps
 CLOCK = 'rosgraph_msgs/msg/Clock'
 RECOVER = 'save what is whole with `vn_nav bag recover`'
@@ -91,16 +87,16 @@ class _Doctor:
         topic = self.topics.get(connection.topic)
         if topic is None:
             topic = self.topics[connection.topic] = self._meet(connection)
-        elif connection != topic.connection and connection.type != topic.connection.type:
+        elif connection != topic.connection and full_name(connection.type) != full_name(
+                topic.connection.type):
             self.find(ERROR, connection.topic, 'types', f'is {topic.connection.type} and '
                       f'{connection.type}', at, 'record it from one publisher')
             return
         topic.count += 1
         topic.bytes += len(message.data)
         passed = topic.logged.add(at, at)
-        if passed < -JUMP:
-            self.find(ERROR, connection.topic, 'clock back', 'was recorded by a clock that was '
-                      'set back', at, 'set the clock before recording; split the bag here')
+        if passed <= -BACK:
+            topic.recorder_back.add(passed, at)
         if not topic.usable:
             return
         try:
@@ -116,14 +112,14 @@ class _Doctor:
     def _meet(self, connection: Connection) -> HeardTopic:
         """Begin with a topic: is it what its name says, and can it be read?"""
         topic = HeardTopic(connection, self._roles.get(connection.topic.strip('/')))
-        if topic.role and connection.type not in TYPES[topic.role]:
-            self.find(ERROR, connection.topic, 'type', f'is {connection.type}, not '
-                      f'{" or ".join(TYPES[topic.role])}', None, 'name the right topic in a YAML '
-                      f'file ({topic.role}: /its/name) and give it with --topics')
+        if topic.role and not fits(topic.role, connection.type):
             topic.usable = False
             return topic
         try:
             self._decode.learn(connection)
+        except Ros1 as error:
+            self.find(ERROR, '', 'ros1', f'is {error.fault}', None, error.remedy)
+            topic.usable = False
         except BagError as error:
             self.find(ERROR if topic.role else WARNING, connection.topic, 'definition',
                       error.fault, None, error.remedy)
@@ -141,14 +137,16 @@ class _Doctor:
             self._poses.pose(stamp)
         if first or topic.role not in STAMPED:
             return
-        if step < 0:
+        if step <= -BACK:
+            topic.set_back.add(step, at)
+        elif step < 0:
             self.find(WARNING, topic.connection.topic, 'unordered', 'has stamps that go back', at,
                       DRIVER + ': such messages are left out')
         elif step == 0:
             self.find(WARNING, topic.connection.topic, 'repeated', 'has the same stamp twice', at,
                       DRIVER + ': such messages are left out')
         # A message that comes late makes the recorder's clock run ahead, not this one.
-        if topic.jump is None and (step - passed > JUMP or step < -JUMP):
+        if topic.jump is None and step - passed > JUMP:
             topic.jump = step - passed, at
 
     def _examine(self, topic: HeardTopic, message: Message, at: int) -> None:
@@ -244,13 +242,18 @@ class _Doctor:
             if topic.role is not None:
                 roles[topic.role].append(topic)
         self._missing(roles)
-        simulated = any(topic.connection.type == CLOCK for topic in self.topics.values())
+        lags = {topic.connection.topic: lag for role in STAMPED for topic in roles[role]
+                if topic.stamps.last and (lag := topic.lag.median()) is not None}
+        simulated = bool(lags) and min(map(abs, lags.values())) > SIMULATED or any(
+            full_name(topic.connection.type) == CLOCK for topic in self.topics.values())
         for topic in (t for role in STAMPED for t in roles[role]):
-            self._gaps(topic)
+            self._gaps(topic, simulated)
             if topic.stamps.last is not None and topic.stamps.last == 0 and topic.count > 1:
                 self.find(ERROR, topic.connection.topic, 'none', 'has stamps of zero', None,
                           'have its driver stamp what it publishes')
-        self._clocks(roles, simulated)
+        self._set_back(roles)
+        if lags and not simulated:  # simulated time runs as it likes
+            self._clocks(roles, lags)
         self._standing(roles)
         order = {ERROR: 0, WARNING: 1}
         return sorted(self._findings.values(), key=lambda f: (
@@ -269,11 +272,16 @@ class _Doctor:
                       'one: ' + RECOVER)
 
     def _missing(self, roles: dict[str, list[HeardTopic]]) -> None:
+        free = {t.connection.topic: t.connection.type for t in self.topics.values()
+                if t.role is None}
+        for topic in (t for same in roles.values() for t in same):
+            if not fits(topic.role, topic.connection.type):
+                self.find(ERROR, topic.connection.topic, 'type', 'is '
+                          f'{topic.connection.type or "of no type"}, not '
+                          f'{" or ".join(TYPES[topic.role])}', None, remedy(topic.role, free))
+
         def candidates(role: str) -> str:
-            there = [t.connection.topic for t in self.topics.values()
-                     if t.connection.type in TYPES[role] and t.role is None]
-            return (f'name one of {", ".join(there[:4])} in a YAML file ({role}: {there[0]}) and '
-                    'give it with --topics' if there else 'record it')
+            return proposal(role, free) or 'record it'
 
         if not roles['image']:
             self.find(ERROR, '', 'image', f'has no camera picture ({self._names.image})', None,
@@ -288,12 +296,14 @@ class _Doctor:
             self.find(WARNING, '', 'camera_info', 'does not say how wide the camera sees '
                       f'({self._names.camera_info})', None, candidates('camera_info'))
 
-    def _gaps(self, topic: HeardTopic) -> None:
+    def _gaps(self, topic: HeardTopic, simulated: bool) -> None:
         times = topic.stamps if topic.stamps.last else topic.logged
         name, median = topic.connection.topic, times.gaps.median()
         if topic.role in ('image', 'odometry') and times.worst > GAP * 1e9:
             self.find(WARNING, name, 'gap', f'pauses for up to {times.worst * 1e-9:.1f} s',
-                      times.worst_at, 'episodes end there; record with a faster disk or network')
+                      times.worst_at, 'episodes end there' + (
+                          ': have the simulator publish it more often' if simulated else
+                          '; record with a faster disk or network'))
         if (topic.role == 'odometry' and median is not None and median > 2e9 * WINDOW
                 and self._poses.alone > MOST_ALONE * self._poses.pictures):
             share = self._poses.alone / self._poses.pictures
@@ -301,12 +311,28 @@ class _Doctor:
                       f'pictures have no pose within {WINDOW * 1e3:.0f} ms', None,
                       f'publish it at {1 / WINDOW:.0f} Hz')
 
-    def _clocks(self, roles: dict[str, list[HeardTopic]], simulated: bool) -> None:
+    def _set_back(self, roles: dict[str, list[HeardTopic]]) -> None:
+        """Clocks that were set back: of the stamps, and of the recorder."""
+        for what, chosen, of in (
+                ('is stamped', STAMPED, lambda topic: topic.set_back),
+                ('was recorded', (*STAMPED, 'command'), lambda topic: topic.recorder_back)):
+            moving = [t for role in ('image', 'odometry' if roles['odometry'] else 'command')
+                      for t in roles[role] if role in chosen]
+            alike = all(of(topic).count for topic in moving)
+            for topic in self.topics.values():
+                back = of(topic)
+                if topic.role not in chosen or not back.count:
+                    continue
+                serious = not alike and topic in moving
+                self.find(ERROR if serious else WARNING, topic.connection.topic, what,
+                          f'{what} by a clock that was set back by {-back.first * 1e-9:.1f} s',
+                          back.at, 'pictures and poses do not fit together behind it: '
+                          'synchronise the clocks (chrony), and record again' if serious else
+                          'a simulator was reset, or these are two takes: an episode ends there',
+                          back.count)
+
+    def _clocks(self, roles: dict[str, list[HeardTopic]], lags: dict[str, float]) -> None:
         """Stamps against the recorder's clock, and of one sensor against another's."""
-        lags = {topic.connection.topic: lag for role in STAMPED for topic in roles[role]
-                if topic.stamps.last and (lag := topic.lag.median()) is not None}
-        if simulated or not lags or min(map(abs, lags.values())) > SIMULATED:
-            return  # simulated time runs as it likes
         for topic in (t for role in STAMPED for t in roles[role] if t.jump is not None):
             jump, at = topic.jump
             self.find(ERROR, topic.connection.topic, 'jump', 'is stamped by a clock that jumps by '

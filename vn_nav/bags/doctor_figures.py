@@ -11,10 +11,12 @@ import statistics
 import numpy as np
 
 from vn_nav.bags.drive import COMMAND_LASTS
+from vn_nav.bags.stamped import WAIT
 from vn_nav.bags.stream import Connection
 
 ERROR, WARNING = 'error', 'warning'
 SAMPLE = 4096  # numbers that a median is taken of, at most
+BACK = round(1e9 * WAIT)  # ns by which a clock goes back that was set back, see `set_back`
 NOISE = 0.0005  # m and rad: smaller steps of a standing robot must not add up
 
 
@@ -30,6 +32,9 @@ class Neighbours:
         self._waiting.append(stamp)
 
     def pose(self, stamp: int) -> None:
+        while self._waiting and stamp <= self._pose - BACK:  # nothing more comes for these
+            self.pictures += 1
+            self.alone += abs(self._waiting.popleft() - self._pose) > self._window
         while self._waiting and self._waiting[0] <= stamp:
             at = self._waiting.popleft()
             self.pictures += 1
@@ -120,6 +125,20 @@ class Times:
         return gap
 
 
+@dataclasses.dataclass
+class SetBack:
+    """Where a clock was set back."""
+
+    count: int = 0
+    first: int = 0  # ns, negative
+    at: int = 0  # ns, when
+
+    def add(self, step: int, at: int) -> None:
+        self.count += 1
+        if self.count == 1:
+            self.first, self.at = step, at
+
+
 class HeardTopic:
     """A topic as it comes by."""
 
@@ -128,6 +147,7 @@ class HeardTopic:
         self.usable = True  # its type is known, and the one of its role
         self.count = self.bytes = 0
         self.logged, self.stamps, self.lag = Times(), Times(), Sample()
+        self.set_back, self.recorder_back = SetBack(), SetBack()
         self.jump: tuple[int, int] | None = None  # ns, of the stamps' clock, and when
         self.pictures: dict[str, None] = {}
         self.looked: int | None = None  # ns, when a picture was decoded

@@ -18,16 +18,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.arrival import wrap_angle
-from vn_nav.errors import UserError
+from vn_nav.bags.roles import Topics
+from vn_nav.bags.stamped import GAP, WAIT, Stamped, set_back
+from vn_nav.bags.stream import messages, summary
 from vn_nav.robot import RobotSpec
 
-WINDOW = 0.05  # s between the stamps of a picture and of what belongs to it
-WAIT = 1.0  # s of recording time that a picture waits for what belongs to it
-GAP = 1.0  # s without a picture end an episode
 COMMAND_LASTS = 0.5  # s that a velocity is believed without a new one, as bases do
 JUMP_SPEED = 5.0  # m/s: faster, somebody has put the robot (or its odometry) elsewhere
 JUMP = 0.3  # m that odometry may be corrected by between two pictures
@@ -37,58 +35,28 @@ COARSE = 0.35  # share of an action that may be missing or too much at its end
 RECORDED = 'recorded'  # world version of pictures from no simulator, or from several
 
 
-@dataclasses.dataclass(frozen=True)
-class Topics:
-    """Names in the bag, with or without the leading slash; a small YAML file can give others."""
-
-    image: str = 'image_raw'
-    odometry: str = 'odom'
-    command: str = 'cmd_vel'  # stands in where odometry is not recorded
-    goal: str = 'goal_image'
-    depth: str = 'depth/image_raw'
-    labels: str = 'labels/image_raw'
-    episode_end: str = 'episode_end'
-    camera_info: str = 'camera_info'
-
-    def within(self, recorded: Iterable[str]) -> Topics:
-        """The same with the names as they are in a bag: slashes as there, pictures compressed.
-
-        Raises:
-            UserError: no camera picture, or neither odometry nor command.
-        """
-        there = {name.strip('/'): name for name in recorded}
-        found = {}
-        for role, name in dataclasses.asdict(self).items():
-            name = name.strip('/')
-            if role in ('image', 'goal') and name not in there:
-                name = f'{name}/compressed'
-            found[role] = there.get(name, '')
-        if not found['image'] or not (found['odometry'] or found['command']):
-            role = 'image' if not found['image'] else 'odometry or command'
-            wanted = getattr(self, role.split()[0])
-            raise UserError(f'a bag to learn from holds the topic {wanted} ({role})',
-                            sorted(there), 'name the topic of the bag in a YAML file '
-                            f'({role.split()[0]}: /its/name) and give it with --topics')
-        return Topics(**found)
-
-
-def load_topics(path: str | Path) -> Topics:
-    """Read a mapping from the roles of `Topics` to names in the bag.
+def find_topics(bag: str | Path, wanted: Topics) -> Topics:
+    """The topics of a bag by their roles, see `Topics.within`.
 
     Raises:
-        UserError: no such file, no such role, or a name that is none.
+        UserError: no readable bag, or topics that it lacks or has with another type.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text())
-    except (OSError, yaml.YAMLError) as error:
-        raise UserError('the topics of a bag are in a YAML file', f'{path}: {error}',
-                        'write lines such as image: /camera/color/image_raw') from error
-    known = [field.name for field in dataclasses.fields(Topics)]
-    if not isinstance(data, dict) or not set(data) <= set(known) or not all(
-            isinstance(name, str) and name.strip('/') for name in data.values()):
-        raise UserError(f'a topics file maps some of {", ".join(known)} to names', data,
-                        f'correct {path}')
-    return Topics(**data)
+    return wanted.within({name: topic.type for name, topic in summary(bag).items()})
+
+
+def hear(bag: str | Path, topics: Topics) -> Iterator[Heard]:
+    """The messages of a drive in the order of recording, one take after the other.
+
+    Args:
+        bag: a rosbag2 folder or an MCAP file.
+        topics: as `find_topics` returns them.
+
+    Raises:
+        BagError: damage, or a message that is not what its topic says.
+    """
+    names = tuple(filter(None, dataclasses.astuple(topics)))
+    for m in messages(bag, names, clocks=(topics.image, topics.odometry or topics.command)):
+        yield Heard(m.topic, m.message, m.time)
 
 
 class Heard(NamedTuple):
@@ -120,7 +88,8 @@ class Report:
 
     pictures: int = 0
     without_pose: int = 0  # no odometry within `WINDOW`
-    unordered: int = 0  # stamps that went back
+    unordered: int = 0  # late and repeated stamps
+    set_back: int = 0  # of the clock of the pictures: a new episode begins
     bad: int = 0  # velocities and poses that are none
     jumps: int = 0  # of the pose: a new episode begins
     episodes: int = 0
@@ -138,20 +107,29 @@ def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> It
 
     Poses are interpolated between the odometry before and after a picture, if the nearer of the
     two lies within `WINDOW`; without odometry, commanded velocities are integrated. An episode
-    ends with a message on `episode_end`, with a new goal, with `GAP` seconds without a picture and
-    where the pose jumps. What is held at a time is bounded by `WAIT` seconds of recording.
+    ends with a message on `episode_end`, with a new goal, with `GAP` seconds without a picture,
+    where the pose jumps and where the clock of the pictures was set back, see `set_back`. What is
+    held at a time is bounded by `WAIT` seconds of recording.
 
     Args:
         messages: in the order of recording.
-        topics: as `Topics.within` returns them.
+        topics: as `find_topics` returns them.
         report: is filled.
     """
     track = _Odometry() if topics.odometry else _DeadReckoning()
-    beside = {name: collections.deque() for name in (topics.depth, topics.labels) if name}
+    beside = {name: Stamped() for name in (topics.depth, topics.labels) if name}
     waiting: collections.deque[tuple[float, float, Any, int, Any]] = collections.deque()
     episode, goal, goal_stamp = 0, None, None
+    newest = -math.inf  # s, of recording
     last: Frame | None = None
     for topic, message, time in messages:
+        if topic in (topics.image, topics.odometry or topics.command):
+            if set_back(time, newest):  # another take: nothing more comes of the one before
+                while waiting:
+                    last = yield from _settle(waiting.popleft(), track, beside, topics, last,
+                                              report)
+                newest = time
+            newest = max(newest, time)
         if topic == topics.image:
             report.pictures += 1
             waiting.append((_stamp(message, time), time, message, episode, goal))
@@ -162,7 +140,7 @@ def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> It
                 except MotionError:
                     report.bad += 1
         elif topic in beside:
-            beside[topic].append((_stamp(message, time), time, message))
+            beside[topic].hear(_stamp(message, time), time, message)
         elif topic == topics.episode_end:
             episode += 1
         elif topic == topics.goal:
@@ -170,8 +148,9 @@ def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> It
             if goal_stamp not in (None, stamp):
                 episode += 1
             goal, goal_stamp = message, stamp
-        while waiting and (track.knows(waiting[0][0]) and _arrived(beside, waiting[0][0])
-                           or waiting[0][1] < time - WAIT):
+        while waiting and (track.knows(waiting[0][0]) and all(
+                rows.reaches(waiting[0][0]) for rows in beside.values())
+                or waiting[0][1] < time - WAIT):
             last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
     while waiting:
         last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
@@ -180,14 +159,15 @@ def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> It
 def _settle(picture, track, beside, topics: Topics, last: Frame | None, report: Report):
     """Yield a picture's frame, if it has one; the last frame that there was."""
     stamp, time, message, episode, goal = picture
-    pose = track.pose(stamp if topics.odometry else time)
+    pose = track.pose(stamp, time)
     if pose is None:
         report.without_pose += 1
         return last
-    if last is not None and stamp <= last.stamp and episode == last.episode:
+    back = last is not None and set_back(stamp, last.stamp)
+    if last is not None and stamp <= last.stamp and not back and episode == last.announced:
         report.unordered += 1
         return last
-    own = {role: _nearest(beside[name], stamp) for role, name in (
+    own = {role: beside[name].nearest(stamp, time) for role, name in (
         ('depth', topics.depth), ('labels', topics.labels)) if name}
     number = 0
     if last is not None:
@@ -196,8 +176,9 @@ def _settle(picture, track, beside, topics: Topics, last: Frame | None, report: 
         gap = stamp - last.stamp > GAP or time - last.time > GAP
         moved = math.hypot(*(pose[:2] - last.pose[:2]))
         jumped = moved > JUMP + JUMP_SPEED * max(stamp - last.stamp, 0.0)
-        report.jumps += jumped and not announced
-        number = last.episode + (announced or gap or jumped)
+        report.set_back += back
+        report.jumps += jumped and not announced and not back
+        number = last.episode + (announced or gap or jumped or back)
     report.episodes = number + 1
     frame = Frame(message, stamp, time, pose, number, episode, goal, **own)
     yield frame
@@ -208,38 +189,23 @@ class _Odometry:
     """Poses by header stamps."""
 
     def __init__(self):
-        self._stamps: collections.deque[float] = collections.deque()
-        self._poses: collections.deque[np.ndarray] = collections.deque()
+        self._heard = Stamped()
 
     def hear(self, message: Any, time: float) -> None:
         values = odometry_to_array(message)
-        stamp = values[6] or time
-        if self._stamps and stamp <= self._stamps[-1]:
-            if self._stamps[-1] - stamp < WAIT:
-                return  # late or repeated
-            self._stamps.clear()  # a clock that was set back
-            self._poses.clear()
-        self._stamps.append(stamp)
-        self._poses.append(values[:3])
-        while self._stamps[-1] - self._stamps[0] > 2 * WAIT:
-            self._stamps.popleft()
-            self._poses.popleft()
+        self._heard.hear(values[6] or time, time, values[:3])
 
     def knows(self, stamp: float) -> bool:
-        return bool(self._stamps) and self._stamps[-1] >= stamp
+        return self._heard.reaches(stamp)
 
-    def pose(self, stamp: float) -> np.ndarray | None:
-        stamps = np.array(self._stamps)
-        if not len(stamps):
+    def pose(self, stamp: float, time: float) -> np.ndarray | None:
+        found = self._heard.around(stamp, time)
+        if found is None:
             return None
-        after = int(np.searchsorted(stamps, stamp))
-        before = max(after - 1, 0)
-        after = min(after, len(stamps) - 1)
-        if min(abs(stamps[before] - stamp), abs(stamps[after] - stamp)) > WINDOW:
-            return None
-        one, other = self._poses[before], self._poses[after]
-        span = stamps[after] - stamps[before]
-        share = np.clip((stamp - stamps[before]) / span, 0, 1) if span > 0 else 0.0
+        before, after = found
+        one, other = before.value, after.value
+        span = after.stamp - before.stamp
+        share = np.clip((stamp - before.stamp) / span, 0, 1) if span > 0 else 0.0
         pose = one + share * (other - one)
         pose[2] = one[2] + share * wrap_angle(other[2] - one[2])
         return pose
@@ -263,11 +229,13 @@ class _DeadReckoning:
     def knows(self, stamp: float) -> bool:
         return True  # messages come in the order of recording
 
-    def pose(self, time: float) -> np.ndarray:
+    def pose(self, stamp: float, time: float) -> np.ndarray:
         self._advance(time)
         return self._pose.copy()
 
     def _advance(self, time: float) -> None:
+        if self._at is not None and set_back(time, self._at):  # another take
+            self._velocity, self._from, self._at = np.zeros(3), -math.inf, time
         if self._at is not None and time > self._at:
             lasts = min(time, self._from + COMMAND_LASTS) - self._at
             if lasts > 0:
@@ -286,19 +254,6 @@ def integrate(pose: np.ndarray, velocity: np.ndarray, seconds: float) -> np.ndar
     ahead, left = (s * vx - c * vy) * seconds, (c * vx + s * vy) * seconds
     return np.array([x + math.cos(yaw) * ahead - math.sin(yaw) * left,
                      y + math.sin(yaw) * ahead + math.cos(yaw) * left, yaw + turn])
-
-
-def _arrived(beside: dict, stamp: float) -> bool:
-    """Whether nothing nearer to a stamp can come any more on the topics beside the picture."""
-    return all(rows and rows[-1][0] >= stamp for rows in beside.values())
-
-
-def _nearest(rows: collections.deque, stamp: float) -> Any:
-    """The message nearest to a stamp, within `WINDOW`, or None; older ones are forgotten."""
-    while len(rows) > 1 and rows[1][0] <= stamp:
-        rows.popleft()
-    near = sorted(list(rows)[:2], key=lambda row: abs(row[0] - stamp))
-    return near[0][2] if near and abs(near[0][0] - stamp) <= WINDOW else None
 
 
 def _stamp(message: Any, time: float) -> float:

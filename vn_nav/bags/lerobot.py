@@ -24,9 +24,10 @@ from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav import __version__
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.drive import COMMAND_LASTS, Frame, Heard, Report, Topics, synchronise
+from vn_nav.bags.drive import COMMAND_LASTS, Frame, Heard, Report, find_topics, hear, synchronise
 from vn_nav.bags.lerobot_stats import Colours, describe, merge
-from vn_nav.bags.stream import messages, summary
+from vn_nav.bags.roles import Topics
+from vn_nav.bags.stamped import set_back
 from vn_nav.errors import UserError
 
 VERSION = 'v3.0'
@@ -96,8 +97,7 @@ def export(bag: str | Path, out: str | Path, *, topics: Topics, robot: str, fps:
     if out.exists():
         raise UserError('a dataset is written into a new folder', str(out),
                         'choose another one, or take that one away')
-    names = topics.within(summary(bag))
-    names = dataclasses.replace(names, depth='', labels='')
+    names = find_topics(bag, dataclasses.replace(topics, depth='', labels=''))
     temporary = out.absolute().with_name(f'.{out.name}.{os.getpid()}.tmp')
     try:
         temporary.mkdir(parents=True)
@@ -124,23 +124,36 @@ class _Velocities:
     """Velocities as they were heard, until nobody asks for them any more."""
 
     def __init__(self):
-        self._heard: collections.deque[tuple[float, np.ndarray]] = collections.deque(maxlen=KEPT)
+        # Rows come later than what was heard: two runs, where a clock was set back in between.
+        self._runs: list[collections.deque[tuple[float, np.ndarray]]] = [
+            collections.deque(maxlen=KEPT)]
 
     def hear(self, at: float, velocity: np.ndarray) -> None:
-        if not self._heard or at > self._heard[-1][0]:
-            self._heard.append((at, velocity))
-        elif at < self._heard[0][0]:  # a clock that was set back
-            self._heard.clear()
+        run = self._runs[-1]
+        if run and set_back(at, run[-1][0]):
+            self._runs = [run, collections.deque(maxlen=KEPT)]
+            run = self._runs[-1]
+        if not run or at > run[-1][0]:
+            run.append((at, velocity))
+
+    def _run(self, at: float) -> collections.deque[tuple[float, np.ndarray]]:
+        """The run that a time lies in, or next to."""
+        return min(self._runs, key=lambda run: max(
+            run[0][0] - at, at - run[-1][0], 0.0) if run else np.inf)
 
     def forget(self, before: float) -> None:
         """Drop what is older than the last one at or before a time."""
-        while len(self._heard) > 1 and self._heard[1][0] <= before:
-            self._heard.popleft()
+        run = self._run(before)
+        while len(run) > 1 and run[1][0] <= before:
+            run.popleft()
+        if run is self._runs[-1]:
+            self._runs = [run]
 
     def near(self, at: float) -> np.ndarray:
         """The one nearest to a time, [3]; zero where there is none."""
-        after = next((entry for entry in self._heard if entry[0] >= at), None)
-        before = next((entry for entry in reversed(self._heard) if entry[0] <= at), None)
+        run = self._run(at)
+        after = next((entry for entry in run if entry[0] >= at), None)
+        before = next((entry for entry in reversed(run) if entry[0] <= at), None)
         both = [entry for entry in (before, after) if entry is not None]
         return (min(both, key=lambda entry: abs(entry[0] - at))[1] if both else np.zeros(3))
 
@@ -156,7 +169,7 @@ class _Velocities:
         """
         end = max(end, begin + 1e-3)  # times since 1970 are told apart to 2e-7 s
         span, total = end - begin, np.zeros(3)
-        entries = [entry for entry in self._heard if entry[0] < end]
+        entries = [entry for entry in self._run(begin) if entry[0] < end]
         for k, (at, velocity) in enumerate(entries):
             until = entries[k + 1][0] if k + 1 < len(entries) else np.inf
             until = min(until, at + COMMAND_LASTS, end)
@@ -211,8 +224,7 @@ class _Dataset:
         return 'commanded' if self._topics.command else 'measured (no commands were recorded)'
 
     def _heard(self, bag: str | Path) -> Iterator[Heard]:
-        wanted = tuple(filter(None, dataclasses.astuple(self._topics)))
-        for m in messages(bag, wanted):
+        for m in hear(bag, self._topics):
             try:
                 if m.topic == self._topics.command:
                     self._commands.hear(m.time, twist_to_array(m.message)[:3])
@@ -221,7 +233,7 @@ class _Dataset:
                     self._odometry.hear(values[6] or m.time, values[3:6])
             except MotionError:
                 pass  # as good as not sent
-            yield Heard(m.topic, m.message, m.time)
+            yield m
 
     def _grid(self, frames: Iterable[Frame]) -> Iterator[Row]:
         """The instants of each episode, from its first picture on as far as pictures go."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.dataset import MAX_DEPTH, DriveSet
-from vn_nav.bags.drive import GAP, JUMP
+from vn_nav.bags.drive import JUMP
 from vn_nav.bags.pose_graph import (
     GATE,
     Edges,
@@ -33,6 +33,7 @@ from vn_nav.bags.pose_graph import (
     solve,
 )
 from vn_nav.bags.same_place import PLAIN, TIGHT, together, unnoticed
+from vn_nav.bags.stamped import GAP
 from vn_nav.bags.two_view import Camera
 from vn_nav.robot import RobotSpec
 
@@ -132,7 +133,7 @@ class _Drive:
         ways = np.hypot(steps[:, 0], steps[:, 1])
         self.stretch = (np.zeros(len(self.odometry), np.int64) if stretch is None else stretch)
         carried = (np.diff(drives.episode) != 0) & (
-            (np.diff(drives.time) > GAP) | (ways > JUMP)) | (np.diff(self.stretch) != 0)
+            (np.abs(np.diff(drives.time)) > GAP) | (ways > JUMP)) | (np.diff(self.stretch) != 0)
         self.way, self.turn, self.net = (  # m driven, rad turned, rad to the left, [N]
             np.append(0.0, np.cumsum(np.where(carried, 0.0, moved)))
             for moved in (ways, np.abs(steps[:, 2]), steps[:, 2]))

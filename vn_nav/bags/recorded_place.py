@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import RECORDED, Topics, load_topics
+from vn_nav.bags.drive import RECORDED
 from vn_nav.bags.loops import ROUNDS, straighten
 from vn_nav.bags.one_place import Part, check_frame, check_place, choose, parse_pictures
+from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.bags.stream import messages
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
@@ -82,7 +83,11 @@ def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec
     facts = drives.facts
     print(f'{args.bag}: {len(drives):,} pictures with poses in {facts["episodes"]:,} '
           f'stretch{"es" * (facts["episodes"] > 1)}; {facts["without_pose"]:,} without a pose, '
-          f'{facts["jumps"]:,} jumps', flush=True)
+          f'{facts["jumps"]:,} jumps' + (f', {facts["set_back"]:,} times the clock of the '
+                                         'pictures was set back' if facts['set_back'] else ''),
+          flush=True)
+    for note in facts['notes']:
+        print(f'{args.bag}: {note}', flush=True)
     part = choose(args.bag, drives, args.pictures)
     if len(part.rows) < len(drives):
         print(f'{len(part.rows):,} of the {len(drives):,} pictures are used'

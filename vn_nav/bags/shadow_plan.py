@@ -22,14 +22,12 @@ from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.dataset import Wanted, read_steps
 from vn_nav.bags.decoding import Decoder
-from vn_nav.bags.drive import MISFIT, Report, Topics
+from vn_nav.bags.drive import MISFIT, Report, find_topics
+from vn_nav.bags.roles import COMPRESSED, Topics, full_name
 from vn_nav.bags.stream import Bag, summary
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 
-ODOMETRY, COMPRESSED = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/CompressedImage'
-TYPES = {'image': ('sensor_msgs/msg/Image', COMPRESSED), 'odometry': (ODOMETRY,),
-         'command': ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped')}
 RATES = 5.0, 20.0  # Hz of commands
 SAMPLE = 400  # messages that tell the rate
 LATEST = (1 << 31) * 10**9  # ns, of what a header can say
@@ -80,13 +78,14 @@ class Plan:
         decisions = {decision.time: decision for decision in self.decisions}
         ticks = self.topics.odometry or self.topics.command
         driving = unseen = False  # in an episode; its last decision was at no picture
-        for message in Bag(self.bag).in_time_order((self.topics.image, ticks)):
+        moving = self.topics.image, ticks
+        for message in Bag(self.bag).in_time_order(moving, clocks=moving):
             stamp = decode.header_stamp(message) or 0
             _check_times(self.bag, message.log_time, stamp)
             if message.connection.topic == ticks:
                 usable = driving and _is_finite(decode(message))
                 due = clock.tick(message.log_time, stamp) if usable else None
-                pose = message.data if message.connection.type == ODOMETRY else None
+                pose = message.data if ticks == self.topics.odometry else None
                 yield None if due is None else Event(message.log_time, due, pose, False, None)
                 continue
             decision = decisions.pop(message.log_time * 1e-9, None)
@@ -197,15 +196,10 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
         UserError: no readable bag, topics or types that are not there, a camera that is too
             narrow, or nothing to decide at.
     """
-    held, report = summary(bag), Report()
-    found = dataclasses.replace(topics, depth='', labels='').within(held)
-    for role, known in TYPES.items():
-        name = getattr(found, role)
-        if name and held[name].type not in known:
-            raise UserError(f'the {role} of a bag is {" or ".join(known)}',
-                            f'{name}: {held[name].type}', 'name another topic with --topics')
-    steps, facts = read_steps(bag, Wanted(robot, topics=dataclasses.replace(
-        topics, depth='', labels='')), report)
+    report = Report()
+    wanted = dataclasses.replace(topics, depth='', labels='')
+    found = find_topics(bag, wanted)
+    steps, facts = read_steps(bag, Wanted(robot, topics=wanted), report)
     decisions, goals, done = [], Goals(goal), None
     for step in steps:
         frame = step.frame
@@ -215,11 +209,15 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
         done = None if step.action == MISFIT else robot.action_names[step.action]
         if step.last:
             goals.keep(frame.episode, frame.goal, frame.image)
+    if len({decision.time for decision in decisions}) < len(decisions):
+        raise UserError('the pictures of a drive were recorded at times of their own',
+                        f"{bag}: the recorder's clock was set back", 'record each take into a '
+                        'bag of its own')
     if not decisions:
         raise UserError('a bag to drive along holds pictures with poses beside them',
                         f'{bag}: {report.pictures} pictures, {report.without_pose} without a '
                         'pose', 'see `vn_nav bag doctor`')
-    return Plan(Path(bag), found, held[found.image].type == COMPRESSED,
+    return Plan(Path(bag), found, full_name(summary(bag)[found.image].type) == COMPRESSED,
                 _rate(bag, found.odometry or found.command), decisions, goals, report,
                 _first(bag, found.camera_info) if facts['fov'] is not None else None)
 

@@ -17,12 +17,13 @@ from vn_nav.bags.compare_drives import (
     markdown,
     read_shadow,
 )
-from vn_nav.bags.drive import Topics
+from vn_nav.bags.roles import Topics
 from vn_nav.bags.shadow_plan import Plan, make_plan
 from vn_nav.errors import UserError
+from vn_nav.files import write_file
 from vn_nav.goal_picture import read_goal_picture
 from vn_nav.nodes.isolation import stay_on_this_host
-from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint, write_file
+from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.robot import RobotSpec, load_robot
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +18,13 @@ from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.agreement import Agreement, judge
 from vn_nav.bags.doctor import diagnose
 from vn_nav.bags.doctor_figures import Diagnosis
-from vn_nav.bags.drive import Cutter, Frame, Heard, Report, Topics, synchronise
+from vn_nav.bags.drive import Cutter, Frame, Heard, Report, find_topics, hear, synchronise
+from vn_nav.bags.roles import Topics
 from vn_nav.bags.show_figures import Film, Goals, Odometer, Shot, Timeline, Ways
-from vn_nav.bags.stream import messages, summary
-from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.robot import RobotSpec
+
+if TYPE_CHECKING:  # it takes torch along
+    from vn_nav.policy.checkpoint import LoadedCheckpoint
 
 RATES, VELOCITIES = 0.5, 0.05  # s: the shortest stretch that either is told of
 AXES = ('vx', 'vy', 'wz')
@@ -59,7 +62,8 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
         UserError: no readable bag, one without a camera or anything that tells motion, or (with
             a checkpoint) a camera that is too narrow or no usable picture.
     """
-    names = topics.within(summary(bag))
+    # Depth and labels are not shown; without them no picture waits for any.
+    names = find_topics(bag, dataclasses.replace(topics, depth='', labels=''))
     rates, velocities = Timeline(RATES), Timeline(VELOCITIES)
     diagnosis = diagnose(bag, topics=topics, listen=lambda message: rates.add(
         message.connection.topic, message.log_time))
@@ -74,9 +78,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
             way.add(frame)
             yield frame
 
-    # Depth and labels are not shown; without them no picture waits for any.
-    alone = dataclasses.replace(names, depth='', labels='')
-    frames = synchronise(_heard(bag, alone, velocities), alone, report)
+    frames = synchronise(_heard(bag, names, velocities), names, report)
     for _ in Cutter(robot, report).cut(watched(frames)):
         pass
     shown = Shown(diagnosis, rates.origin * 1e-9, names, rates, velocities, way.ways(),
@@ -88,8 +90,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
 
 def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[Heard]:
     """The messages of a drive; velocities are noted as they pass."""
-    wanted = tuple(filter(None, dataclasses.astuple(names)))
-    for m in messages(bag, wanted):
+    for m in hear(bag, names):
         kind = {names.command: 'commanded', names.odometry: 'measured'}.get(m.topic)
         if kind is not None:
             try:
@@ -99,5 +100,5 @@ def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[Hea
                 pass  # the doctor has told of it
             else:
                 for axis, value in zip(AXES, velocity, strict=True):
-                    velocities.add(f'{kind} {axis}', m.log_time, float(value))
-        yield Heard(m.topic, m.message, m.time)
+                    velocities.add(f'{kind} {axis}', round(m.time * 1e9), float(value))
+        yield m

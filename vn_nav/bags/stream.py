@@ -8,24 +8,18 @@ or not what it says, is a `BagError`; with `strict=False` it is passed over and 
 from __future__ import annotations
 
 import heapq
-import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
+from vn_nav.bags.bag_files import METADATA, UNLISTED, files_of, load_yaml
 from vn_nav.bags.decoding import Decoder
 from vn_nav.bags.mcap_input import Loss, McapFile
-from vn_nav.bags.mcap_records import A_BAG, BagError, Connection, Message
+from vn_nav.bags.mcap_records import BagError, Connection, Message
 
-__all__ = ['Bag', 'BagError', 'Connection', 'Decoded', 'Loss', 'Message', 'Topic', 'in_time_order',
-           'messages', 'summary']
+__all__ = ['METADATA', 'UNLISTED', 'Bag', 'BagError', 'Connection', 'Decoded', 'Loss', 'Message',
+           'Topic', 'in_time_order', 'load_yaml', 'messages', 'summary']
 
-METADATA = 'metadata.yaml'
-UNLISTED = 'metadata.yaml does not name it'
-MAX_METADATA = 1 << 20  # bytes; a day of hourly files with a hundred topics has 200 kB
-MAX_NESTED = 32  # brackets within brackets
 ORDER_WINDOW = 1_000_000_000  # ns by which recorders write a message late, at most
 MAX_HELD = 64 << 20  # bytes that wait to be put in order: two seconds of raw 640 x 480 at 30 Hz
 
@@ -33,7 +27,7 @@ MAX_HELD = 64 << 20  # bytes that wait to be put in order: two seconds of raw 64
 class Topic(NamedTuple):
     """What a bag holds of a topic."""
 
-    type: str
+    type: str  # where its publishers disagree: all of them, with ' and ' between
     count: int
 
 
@@ -60,19 +54,19 @@ class Bag:
     """
 
     def __init__(self, path: str | Path, *, strict: bool = True):
-        self.path, self._own, self._reading = Path(path), [], 0
-        paths = self._paths(strict) if self.path.is_dir() else [_mcap(self.path)]
-        self.files = []
+        self.path, self._reading, self.files = Path(path), 0, []
+        paths, self._own = files_of(path, strict=strict)
+        unreadable: BagError | None = None
         for file in paths:
             try:
                 self.files.append(McapFile(file, strict=strict))
             except BagError as error:
+                unreadable = unreadable or error
                 if strict:
                     raise
                 self._own.append(Loss(file, 0, 0, error.fault))
         if not self.files:
-            fault = 'none of its files can be read' if paths else 'holds no MCAP file'
-            raise BagError(path, fault, rule=A_BAG, remedy='give the path of a recording')
+            raise unreadable or BagError(path, 'metadata.yaml names no file')
 
     @property
     def losses(self) -> list[Loss]:
@@ -99,12 +93,13 @@ class Bag:
             self._reading = number
             yield from file.messages(wanted)
 
-    def in_time_order(self, topics: Iterable[str] | None = None) -> Iterator[Message]:
+    def in_time_order(self, topics: Iterable[str] | None = None, clocks: Iterable[str] = ()
+                      ) -> Iterator[Message]:
         """The messages by the time of recording, as playing a bag has them; see `in_time_order`.
 
         Where the files have an index the order is exact, within `MAX_HELD`.
         """
-        return in_time_order(self.messages(topics), ahead=self._ahead)
+        return in_time_order(self.messages(topics), ahead=self._ahead, clocks=clocks)
 
     def _ahead(self) -> int | None:
         """The time [ns] before which nothing is still to be read; None: unknown."""
@@ -121,7 +116,8 @@ class Bag:
 
         def count(connection: Connection, number: int) -> None:
             before = found.get(connection.topic, Topic(connection.type, 0))
-            found[connection.topic] = before._replace(count=before.count + number)
+            kinds = dict.fromkeys([*before.type.split(' and '), connection.type])
+            found[connection.topic] = Topic(' and '.join(kinds), before.count + number)
 
         for file in self.files:
             declared = file.channels
@@ -134,46 +130,22 @@ class Bag:
                     count(message.connection, 1)
         return found
 
-    def _paths(self, strict: bool) -> list[Path]:
-        """The files of a folder: as its metadata.yaml has them, or by their numbers."""
-        there = sorted(self.path.glob('*.mcap'), key=lambda path: [
-            int(part) if part.isdecimal() else part for part in re.split(r'([0-9]+)', path.name)])
-        if not (self.path / METADATA).is_file():
-            if not there:
-                _refuse_other_formats(self.path, [path.name for path in self.path.iterdir()])
-            return there  # the files tell all; the recorder may have been killed before it did
-        try:
-            listed = _listed(self.path)
-        except BagError as error:
-            if strict:
-                raise
-            self._own.append(Loss(error.path, 0, 0, error.fault, harmless=True))
-            return there
-        gone = [path for path in listed if not path.is_file()]
-        if gone and strict:
-            raise BagError(gone[0], 'metadata.yaml names it, and it is not there', remedy='copy '
-                           'the bag again, or read what is left with `vn_nav bag recover`')
-        self._own += [Loss(path, 0, 0, 'the file is not there') for path in gone]
-        more = [] if strict else [path for path in there if path not in listed]
-        self._own += [Loss(path, 0, 0, UNLISTED, harmless=True)
-                      for path in more]
-        return [path for path in listed if path not in gone] + more
 
-
-def messages(bag: str | Path, topics: Iterable[str] | None = None, *, strict: bool = True
-             ) -> Iterator[Decoded]:
+def messages(bag: str | Path, topics: Iterable[str] | None = None, *, strict: bool = True,
+             clocks: Iterable[str] = ()) -> Iterator[Decoded]:
     """The messages of a bag as objects, in the order of the time of recording.
 
     Args:
         bag: a rosbag2 folder or an MCAP file.
         topics: names, with or without the leading slash; None: all.
         strict: as of `Bag`.
+        clocks: as of `in_time_order`.
 
     Raises:
         BagError: no readable bag, or a message that is not what its topic says.
     """
     decode = Decoder()
-    for message in Bag(bag, strict=strict).in_time_order(topics):
+    for message in Bag(bag, strict=strict).in_time_order(topics, clocks):
         yield Decoded(message.connection.topic, decode(message), message.log_time * 1e-9,
                       message.log_time, message.publish_time)
 
@@ -188,7 +160,8 @@ def summary(bag: str | Path) -> dict[str, Topic]:
 
 
 def in_time_order(stream: Iterable[Message], window: int = ORDER_WINDOW, limit: int = MAX_HELD,
-                  ahead: Callable[[], int | None] = lambda: None) -> Iterator[Message]:
+                  ahead: Callable[[], int | None] = lambda: None, clocks: Iterable[str] = ()
+                  ) -> Iterator[Message]:
     """Messages by the time of recording.
 
     A message is held until nothing earlier can come. Without an index that is believed when one
@@ -200,83 +173,26 @@ def in_time_order(stream: Iterable[Message], window: int = ORDER_WINDOW, limit: 
         window: ns.
         limit: bytes.
         ahead: the time [ns] before which nothing is still to come, if it is known.
+        clocks: topics whose own times go on. Where one goes back by `window` the recorder's clock
+            was set back, and another take begins: what came before it comes first.
     """
-    held: list[tuple[int, int, Message]] = []
-    newest, size = 0, 0
+    held: list[tuple[int, int, int, Message]] = []
+    newest, size, take = 0, 0, 0
+    last: dict[str, int] = dict.fromkeys(filter(None, clocks), 0)
     for number, message in enumerate(stream):
-        heapq.heappush(held, (message.log_time, number, message))
-        newest, size = max(newest, message.log_time), size + len(message.data)
+        name, time = message.connection.topic, message.log_time
+        if name in last:
+            if time <= last[name] - window:
+                take, newest, last = take + 1, 0, dict.fromkeys(last, 0)
+            last[name] = time
+        heapq.heappush(held, (take, time, number, message))
+        newest, size = max(newest, time), size + len(message.data)
         settled = ahead()
         if settled is None:
             settled = newest - window
-        while held and (held[0][0] <= settled or size > limit):
-            first = heapq.heappop(held)[2]
+        while held and (held[0][0] < take or held[0][1] <= settled or size > limit):
+            first = heapq.heappop(held)[3]
             size -= len(first.data)
             yield first
     while held:
-        yield heapq.heappop(held)[2]
-
-
-def load_yaml(text: str) -> Any:
-    """What a YAML text of a bag says.
-
-    Raises:
-        ValueError: what takes quadratic or exponential time to read, and no bag needs.
-        Exception: many others; the text is nobody's to vouch for.
-    """
-    depth = deepest = 0
-    for bracket in re.findall(r'[][{}]', text):
-        depth += 1 if bracket in '[{' else -1
-        deepest = max(deepest, depth)
-    if deepest > MAX_NESTED or '<<' in text:
-        raise ValueError('brackets within brackets, or merged mappings')
-    return yaml.safe_load(text)
-
-
-def _listed(folder: Path) -> list[Path]:
-    """The files that metadata.yaml names."""
-    path = folder / METADATA
-    try:
-        if path.stat().st_size > MAX_METADATA:
-            raise BagError(path, f'has more than {MAX_METADATA} bytes')
-        information = load_yaml(path.read_text())['rosbag2_bagfile_information']
-        names = [str(name) for name in information['relative_file_paths']]
-        mode, storage = (str(information.get(key) or '').lower()
-                         for key in ('compression_mode', 'storage_identifier'))
-    except BagError:
-        raise
-    except Exception as error:  # no end to what YAML can be instead
-        raise BagError(path, f'is not the metadata of a bag ({type(error).__name__})',
-                       remedy='take it away: the MCAP files tell all that is in it') from error
-    _refuse_other_formats(folder, names)
-    if mode == 'message':
-        raise BagError(path, 'its messages are compressed one by one', rule=A_BAG, remedy='write '
-                       'the bag anew with `ros2 bag convert`, without compression_mode message')
-    if storage not in ('mcap', ''):
-        raise BagError(path, f'its storage is {storage!r}', rule=A_BAG, remedy='write the bag '
-                       'anew with `ros2 bag convert`, storage_id mcap')
-    for name in names:
-        if Path(name).name != name or name in ('', '..'):
-            raise BagError(path, f'it names {name!r}, which is not within the folder',
-                           remedy='correct relative_file_paths')
-    return [folder / name for name in names]
-
-
-def _mcap(path: Path) -> Path:
-    _refuse_other_formats(path.parent, [path.name])
-    return path
-
-
-def _refuse_other_formats(folder: Path, names: list[str]) -> None:
-    for name in names:
-        for suffix, what, remedy in (
-                ('.mcap.zstd', 'a file that is compressed as a whole', 'decompress it (`zstd -d '
-                 '--rm FILE.mcap.zstd`), take metadata.yaml away, and read the .mcap file'),
-                ('.db3', 'a bag in SQLite', 'write it anew with `ros2 bag convert`, storage_id '
-                 'mcap, or with `rosbags-convert --dst-storage mcap`'),
-                ('.db3.zstd', 'a bag in SQLite', 'write it anew with `ros2 bag convert`, '
-                 'storage_id mcap'),
-                ('.bag', 'a bag of ROS 1', 'write it anew with `rosbags-convert --dst-storage '
-                 'mcap`')):
-            if name.endswith(suffix):
-                raise BagError(folder / name, what, rule=A_BAG, remedy=remedy)
+        yield heapq.heappop(held)[3]

@@ -15,7 +15,7 @@ from vn_nav.evaluation.chart import Series, Shape, legend, panel, to_picture, to
 from vn_nav.evaluation.curves import THRESHOLDS, Run, average, grouped, read_runs, summary
 from vn_nav.evaluation.page import CURVES, page, table
 from vn_nav.evaluation.terminal import print_table
-from vn_nav.policy.checkpoint import write_file
+from vn_nav.files import write_file
 
 WIDTH, PLOT = 1040, 330  # pixels: of the chart, and the height of its panels
 PANELS = ((56.0, 500.0), (580.0, 1024.0))  # left and right

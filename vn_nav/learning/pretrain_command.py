@@ -13,8 +13,9 @@ from pathlib import Path
 import torch
 
 from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import RECORDED, Topics, load_topics
+from vn_nav.bags.drive import RECORDED
 from vn_nav.bags.recorded_place import scene_of
+from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.errors import UserError
 from vn_nav.learning.command import CHANGES, train_config
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split
@@ -148,6 +149,8 @@ def load_bags(bags: Sequence[Path], robot: RobotSpec, size: int, topics: Topics,
         sets.append(load_drives(bag, wanted, cache))
         worlds.add(str(scene.get('world_version', RECORDED)))
         print(_describe(bag, sets[-1], wanted), flush=True)
+        for note in sets[-1].facts['notes']:
+            print(f'{bag}: {note}', flush=True)
     return Drives(sets, robot), worlds
 
 

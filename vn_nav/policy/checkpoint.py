@@ -20,54 +20,22 @@ import safetensors.torch
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.files import sync_folder, write_file
+from vn_nav.policy.checkpoint_info import (
+    CARD,
+    CHECKSUM,
+    CONFIG,
+    FORMAT,
+    NUMBER,
+    WEIGHTS,
+    check_info,
+    config_checksum,
+    read_config,
+)
 from vn_nav.policy.network import NetworkConfig, Policy
-from vn_nav.structured_file import read_json
 
-WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
-FORMAT = 2
-OWN = {'format', 'network', 'action_names', 'sha256'}  # keys beside those of INFO
-CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
 HEADER_BYTES = 1_000_000  # of a safetensors file, beside its weights
 MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
-NUMBER = (int, float)
-DECODINGS = ('sample', 'greedy')
-REQUIRED = object()
-# What a checkpoint says beside its weights, and what it says when nobody told it.
-INFO = {
-    'world_version': REQUIRED,  # of the simulator's pixels, houses and motion
-    'camera_fov_deg': REQUIRED,  # of the square picture
-    'camera_height': REQUIRED,  # m above the floor
-    'decoding': 'sample',  # the rule that `results` were measured with
-    'houses': [],  # seeds
-    'rooms': None,  # of each house
-    'task': 'image',  # what it was trained for
-    'objects': 1,  # in the house at a time
-    'randomisation': 'none',  # of light, camera and base: a name, or a file's path
-    'preset': '',  # see vn_nav.learning.presets
-    'goals_per_room': 1,  # of each house
-    'goal_variants': None,  # differently lit pictures of each goal; None: the randomisation's
-    'stop_threshold': None,  # probability of arrival above which the policy declares its stop
-    'seed': None,
-    'frames': 0,  # agent decisions
-    'minutes': 0.0,  # wall-clock of training
-    'command': '',  # that trained it
-    'data': '',  # recorded pictures that it learned from, in words; empty: it learned by driving
-    'losses': [],  # what `vn_nav pretrain` learned; no episode was driven
-    'results': {},  # measured figures and controls, by name
-    'notes': '',
-}
-# Their types, and the least and the greatest value of numbers. None is allowed where it is the
-# value when nobody told.
-INFO_TYPES = {
-    'world_version': (str,), 'decoding': (str,), 'task': (str,), 'randomisation': (str,),
-    'preset': (str,), 'command': (str,), 'notes': (str,), 'results': (dict,),
-    'data': (str,), 'losses': (list, tuple),
-    'houses': (list, tuple), 'rooms': (int, 1, 1000), 'objects': (int, 0, 1000),
-    'goals_per_room': (int, 1, 1000), 'goal_variants': (int, 1, 1000),
-    'stop_threshold': (NUMBER, 0, 1), 'seed': (int, -2**63, 2**64), 'frames': (int, 0, 2**63),
-    'minutes': (NUMBER, 0, 1e9), 'camera_fov_deg': (NUMBER, 1e-3, 179),
-    'camera_height': (NUMBER, 1e-3, 100),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +62,7 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
             that is not finite, or a full disk; the checkpoint before is whole.
     """
     folder = Path(folder)
-    info = _check_info(info, 'the checkpoint to save')
+    info = check_info(info, 'the checkpoint to save')
     tensors = {}
     for name, tensor in network.state_dict().items():
         stored = tensor.detach().to(torch.float16 if half else torch.float32)
@@ -114,7 +82,7 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
     try:
         # As it will be read: JSON has no tuples, and only text as keys.
         config = json.loads(json.dumps(config, allow_nan=False))
-        config[CHECKSUM] = _config_checksum(config)
+        config[CHECKSUM] = config_checksum(config)
         text = json.dumps(config, indent=2, allow_nan=False) + '\n'
     except (TypeError, ValueError) as error:
         raise UserError('info holds only JSON values', str(error), 'convert them first') from error
@@ -143,24 +111,8 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
             wrong type or size, or other actions.
     """
     folder = Path(folder)
-    for name in (CONFIG, WEIGHTS):
-        if not (folder / name).is_file():
-            raise UserError(f'a checkpoint is a folder with {CONFIG} and {WEIGHTS}',
-                            str(folder / name), 'pass such a folder; shipped ones are in models/')
+    config, info = read_config(folder)
     where = str(folder / CONFIG)
-    config = read_json(where, CONFIG, 'get the checkpoint again')
-    if config.get('format') != FORMAT:
-        raise UserError(f'{CONFIG} has format {FORMAT}', reprlib.repr(config.get('format')),
-                        'use the version of vn_nav that wrote it, or train again')
-    if missing := OWN - config.keys():
-        raise UserError(f'{CONFIG} has the keys {", ".join(sorted(OWN))}',
-                        f'{where} without {", ".join(sorted(missing))}',
-                        'get the checkpoint again')
-    if CHECKSUM in config and config.pop(CHECKSUM) != _config_checksum(config):
-        raise UserError(f'{CONFIG} is as it was written ({CHECKSUM} is the SHA-256 of the rest)',
-                        where, 'the file is corrupt: get the checkpoint again; after a change of '
-                        f'your own remove {CHECKSUM}')
-    info = _check_info({key: value for key, value in config.items() if key not in OWN}, where)
     network_config, shapes = _read_network(config, where)
     if expect_actions is not None and tuple(expect_actions) != network_config.actions:
         raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
@@ -174,12 +126,6 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
     network = Policy(network_config)
     network.load_state_dict(tensors)
     return LoadedCheckpoint(network.eval(), network_config, {**info, 'sha256': digest})
-
-
-def _config_checksum(config: dict) -> str:
-    """SHA-256 of what a configuration says, however its file is laid out."""
-    text = json.dumps(config, sort_keys=True, separators=(',', ':'), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read_network(config: dict, where: str) -> tuple[NetworkConfig, dict[str, tuple]]:
@@ -264,40 +210,6 @@ def _check_weights(weights: bytes, wanted: dict[str, tuple], where: str
             raise UserError('weights are finite numbers of 16 or 32 bits', f'{name} in {where}',
                             'get the checkpoint again')
     return {name: tensor.float() for name, tensor in tensors.items()}
-
-
-def _check_info(info: dict, where: str) -> dict:
-    unknown = sorted(info.keys() - INFO.keys())
-    if unknown:
-        raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} beside the network',
-                        f'{unknown[0]} in {where}', 'remove it, or use the version of vn_nav '
-                        'that wrote it')
-    full = {key: info.get(key, default) for key, default in INFO.items()}
-    missing = [key for key, value in full.items() if value is REQUIRED]
-    if missing:
-        raise UserError(f'{CONFIG} has the key {missing[0]}', f'{where} without it', 'add it')
-    for key, value in full.items():
-        if value is not None or INFO[key] is not None:
-            _check_entry(key, value, where)
-    if full['decoding'] not in DECODINGS:
-        raise UserError('decoding is sample or greedy', full['decoding'], f'correct {where}')
-    return full
-
-
-def _check_entry(key: str, value: object, where: str) -> None:
-    """Raise a `UserError` for a value of another type than its key's, or out of its range."""
-    rule = INFO_TYPES[key]
-    kinds, span = (rule[0], rule[1:]) if len(rule) == 3 else (rule, ())
-    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
-    kept = isinstance(value, kinds) and not isinstance(value, bool)
-    if kept and key == 'houses':
-        kept = all(isinstance(house, int) and not isinstance(house, bool) for house in value)
-    if not kept:
-        names = ' or '.join(kind.__name__ for kind in kinds)
-        raise UserError(f'{key} is {names}', reprlib.repr(value), f'correct {where}')
-    if span and not span[0] <= value <= span[1]:
-        raise UserError(f'{key} lies between {span[0]:g} and {span[1]:g}', value,
-                        f'correct {where}')
 
 
 def model_card(config: dict, parameters: int, size: int) -> str:
@@ -387,20 +299,6 @@ def _figure(value: object) -> str:
     return str(value)
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file that appears, or is replaced, whole or not at all, and survives a crash."""
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
-    try:
-        with open(temporary, 'wb') as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    _sync_folder(path.parent)
-
-
 def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
     """Write a folder that appears, or is replaced, whole or not at all."""
     folder = folder.absolute()
@@ -421,7 +319,7 @@ def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
             temporary.rename(folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    _sync_folder(folder.parent)
+    sync_folder(folder.parent)
 
 
 def _exchange(one: Path, other: Path) -> None:
@@ -437,11 +335,3 @@ def _exchange(one: Path, other: Path) -> None:
         other.rename(aside)
         one.rename(other)
         aside.rename(one)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -10,7 +10,8 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.checkpoint import DECODINGS, load_checkpoint
+from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.policy.checkpoint_info import DECODINGS
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
 from vn_nav.policy.spot import SpotMemory

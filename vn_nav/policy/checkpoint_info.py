@@ -1,0 +1,139 @@
+"""What a checkpoint says of itself, read without torch: the content of its `config.json`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import reprlib
+from pathlib import Path
+from typing import Any
+
+from vn_nav.errors import UserError
+from vn_nav.structured_file import read_json
+
+WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
+FORMAT = 2
+OWN = {'format', 'network', 'action_names', 'sha256'}  # keys beside those of INFO
+CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
+NUMBER = (int, float)
+DECODINGS = ('sample', 'greedy')
+REQUIRED = object()
+# What a checkpoint says beside its weights, and what it says when nobody told it.
+INFO = {
+    'world_version': REQUIRED,  # of the simulator's pixels, houses and motion
+    'camera_fov_deg': REQUIRED,  # of the square picture
+    'camera_height': REQUIRED,  # m above the floor
+    'decoding': 'sample',  # the rule that `results` were measured with
+    'houses': [],  # seeds
+    'rooms': None,  # of each house
+    'task': 'image',  # what it was trained for
+    'objects': 1,  # in the house at a time
+    'randomisation': 'none',  # of light, camera and base: a name, or a file's path
+    'preset': '',  # see vn_nav.learning.presets
+    'goals_per_room': 1,  # of each house
+    'goal_variants': None,  # differently lit pictures of each goal; None: the randomisation's
+    'stop_threshold': None,  # probability of arrival above which the policy declares its stop
+    'seed': None,
+    'frames': 0,  # agent decisions
+    'minutes': 0.0,  # wall-clock of training
+    'command': '',  # that trained it
+    'data': '',  # recorded pictures that it learned from, in words; empty: it learned by driving
+    'losses': [],  # what `vn_nav pretrain` learned; no episode was driven
+    'results': {},  # measured figures and controls, by name
+    'notes': '',
+}
+# Their types, and the least and the greatest value of numbers. None is allowed where it is the
+# value when nobody told.
+INFO_TYPES = {
+    'world_version': (str,), 'decoding': (str,), 'task': (str,), 'randomisation': (str,),
+    'preset': (str,), 'command': (str,), 'notes': (str,), 'results': (dict,),
+    'data': (str,), 'losses': (list, tuple), 'houses': (list, tuple),
+    'rooms': (int, 1, 1000), 'objects': (int, 0, 1000),
+    'goals_per_room': (int, 1, 1000), 'goal_variants': (int, 1, 1000),
+    'stop_threshold': (NUMBER, 0, 1), 'seed': (int, -2**63, 2**64), 'frames': (int, 0, 2**63),
+    'minutes': (NUMBER, 0, 1e9), 'camera_fov_deg': (NUMBER, 1e-3, 179),
+    'camera_height': (NUMBER, 1e-3, 100),
+}
+
+
+def read_config(folder: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read and check `config.json`; the network and the weights are not looked at.
+
+    Returns:
+        All of it, and of it the keys of `INFO`.
+
+    Raises:
+        UserError: a missing or corrupt file, another format, missing or unknown keys, or values
+            of a wrong type or size.
+    """
+    folder = Path(folder)
+    for name in (CONFIG, WEIGHTS):
+        if not (folder / name).is_file():
+            raise UserError(f'a checkpoint is a folder with {CONFIG} and {WEIGHTS}',
+                            str(folder / name), 'pass such a folder; shipped ones are in models/')
+    where = str(folder / CONFIG)
+    config = read_json(where, CONFIG, 'get the checkpoint again')
+    if config.get('format') != FORMAT:
+        raise UserError(f'{CONFIG} has format {FORMAT}', reprlib.repr(config.get('format')),
+                        'use the version of vn_nav that wrote it, or train again')
+    if missing := OWN - config.keys():
+        raise UserError(f'{CONFIG} has the keys {", ".join(sorted(OWN))}',
+                        f'{where} without {", ".join(sorted(missing))}',
+                        'get the checkpoint again')
+    if CHECKSUM in config and config.pop(CHECKSUM) != config_checksum(config):
+        raise UserError(f'{CONFIG} is as it was written ({CHECKSUM} is the SHA-256 of the rest)',
+                        where, 'the file is corrupt: get the checkpoint again; after a change of '
+                        f'your own remove {CHECKSUM}')
+    info = {key: value for key, value in config.items() if key not in OWN}
+    return config, check_info(info, where)
+
+
+def config_checksum(config: dict) -> str:
+    """SHA-256 of what a configuration says, however its file is laid out."""
+    text = json.dumps(config, sort_keys=True, separators=(',', ':'), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def check_info(info: dict, where: str) -> dict:
+    """The keys of `INFO` with their defaults.
+
+    Args:
+        info: some of them.
+        where: they stand, for people.
+
+    Raises:
+        UserError: a missing or unknown key, or a value of a wrong type or size.
+    """
+    unknown = sorted(info.keys() - INFO.keys())
+    if unknown:
+        raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} beside the network',
+                        f'{unknown[0]} in {where}', 'remove it, or use the version of vn_nav '
+                        'that wrote it')
+    full = {key: info.get(key, default) for key, default in INFO.items()}
+    missing = [key for key, value in full.items() if value is REQUIRED]
+    if missing:
+        raise UserError(f'{CONFIG} has the key {missing[0]}', f'{where} without it', 'add it')
+    for key, value in full.items():
+        if value is not None or INFO[key] is not None:
+            _check_entry(key, value, where)
+    if full['decoding'] not in DECODINGS:
+        raise UserError('decoding is sample or greedy', full['decoding'], f'correct {where}')
+    return full
+
+
+def _check_entry(key: str, value: object, where: str) -> None:
+    """Raise a `UserError` for a value of another type than its key's, or out of its range."""
+    rule = INFO_TYPES[key]
+    kinds, span = (rule[0], rule[1:]) if len(rule) == 3 else (rule, ())
+    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+    kept = isinstance(value, kinds) and not isinstance(value, bool)
+    if kept and key == 'houses':
+        kept = all(isinstance(house, int) and not isinstance(house, bool) for house in value)
+    if kept and key == 'losses':
+        kept = all(isinstance(name, str) for name in value)
+    if not kept:
+        names = ' or '.join(kind.__name__ for kind in kinds)
+        raise UserError(f'{key} is {names}', reprlib.repr(value), f'correct {where}')
+    if span and not span[0] <= value <= span[1]:
+        raise UserError(f'{key} lies between {span[0]:g} and {span[1]:g}', value,
+                        f'correct {where}')
