@@ -191,8 +191,7 @@ def test_a_terminal_that_is_gone_ends_a_node_cleanly():
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_the_first_compilation_says_that_it_goes_on_and_can_be_ended(
-        number, tmp_path, monkeypatch):
+def test_the_first_compilation_shows_progress_and_can_be_ended(number, tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'cache'))
     log = tmp_path / 'log'
     with child(NODES['sim_bridge_node'], log, house=7) as process:
