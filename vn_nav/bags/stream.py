@@ -7,6 +7,7 @@ or not what it says, is a `BagError`; with `strict=False` it is passed over and 
 
 from __future__ import annotations
 
+import collections
 import heapq
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -61,6 +62,8 @@ class Bag:
 
     def __init__(self, path: str | Path, *, strict: bool = True):
         self.path, self._own, self._reading = Path(path), [], 0
+        self.ros_distro: str | None = None  # as metadata.yaml has it
+        self.custom_data: dict[str, str] | None = None  # likewise
         paths = self._paths(strict) if self.path.is_dir() else [_mcap(self.path)]
         self.files = []
         for file in paths:
@@ -84,6 +87,21 @@ class Bag:
         """Messages that the files count and that were not read; None: a file does not count."""
         known = [file.missing for file in self.files]
         return None if None in known else sum(known)
+
+    @property
+    def notes(self) -> list[str]:
+        """What is no damage and worth knowing, after reading with `strict=False`."""
+        notes, passed = [], collections.Counter()
+        if without := sum(file.unchecked > 0 for file in self.files):
+            which = f'{without} of {len(self.files)} files have' if len(self.files) > 1 else (
+                f'{self.files[0].path} has')
+            notes.append(f'{which} no checksums: what changed within a message cannot be known')
+        for file in self.files:
+            passed.update(file.passed)
+        if passed:
+            notes.append('left out are records of kinds that are not known here: ' + ', '.join(
+                f'{kind:#04x} ({size} bytes)' for kind, size in sorted(passed.items())))
+        return notes
 
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[Message]:
         """The messages in the order of the files.
@@ -143,7 +161,8 @@ class Bag:
                 _refuse_other_formats(self.path, [path.name for path in self.path.iterdir()])
             return there  # the files tell all; the recorder may have been killed before it did
         try:
-            listed = _listed(self.path)
+            information, listed = _listed(self.path)
+            self.ros_distro, self.custom_data = _source(information)
         except BagError as error:
             if strict:
                 raise
@@ -233,8 +252,17 @@ def load_yaml(text: str) -> Any:
     return yaml.safe_load(text)
 
 
-def _listed(folder: Path) -> list[Path]:
-    """The files that metadata.yaml names."""
+def _source(information: dict) -> tuple[str | None, dict[str, str] | None]:
+    """The ROS distribution and the user's own data of a bag; None: it does not say."""
+    distro, data = information.get('ros_distro'), information.get('custom_data')
+    whole = isinstance(data, dict) and all(
+        isinstance(word, (str, int, float)) for pair in data.items() for word in pair)
+    return (distro if isinstance(distro, str) and distro.isprintable() else None,
+            {str(key): str(value) for key, value in data.items()} if whole and data else None)
+
+
+def _listed(folder: Path) -> tuple[dict, list[Path]]:
+    """What metadata.yaml says, and the files that it names."""
     path = folder / METADATA
     try:
         if path.stat().st_size > MAX_METADATA:
@@ -259,7 +287,7 @@ def _listed(folder: Path) -> list[Path]:
         if Path(name).name != name or name in ('', '..'):
             raise BagError(path, f'it names {name!r}, which is not within the folder',
                            remedy='correct relative_file_paths')
-    return [folder / name for name in names]
+    return information, [folder / name for name in names]
 
 
 def _mcap(path: Path) -> Path:
