@@ -1,8 +1,10 @@
 """`vn_nav bag recover` saves what is whole, tells what was lost, leaves the old bag alone."""
 
 import os
+import random
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -10,6 +12,7 @@ import time
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import IndexType
 from rosbags.highlevel import AnyReader
 from small_bags import START, STRING, drive, make, records, serialised, write
 
@@ -153,3 +156,116 @@ def test_odd_things_are_kept_as_they_are(tmp_path):
                  definitions={'a/msg/B': '{}'})
     recover(path, tmp_path / 'out')
     assert contents(tmp_path / 'out') == contents(path)
+
+
+# Files without checksums, as rosbag2 writes them.
+
+
+NO_CRC = {'enable_crcs': False}
+LAYOUTS = {
+    'chunks': {'compression': '', **NO_CRC},
+    'chunks in zstd': {'compression': 'zstd', **NO_CRC},
+    'chunks in lz4': {'compression': 'lz4', **NO_CRC},
+    'no index': {'compression': '', 'index_types': IndexType.NONE, **NO_CRC},
+    'killed': {'compression': '', 'finish': False, **NO_CRC},
+    'no chunks': {'chunked': False, **NO_CRC},
+    'no chunks, killed': {'chunked': False, 'finish': False, **NO_CRC}}
+
+
+def lengths(data):
+    """(place, bytes) of the numbers in a sound file that say how long something is."""
+    at = 8
+    while at + 9 < len(data):
+        opcode, length = struct.unpack_from('<BQ', data, at)
+        if opcode == 0x0F:  # what comes now is the summary
+            return
+        yield at + 1, 8
+        if opcode == CHUNK:
+            name = int.from_bytes(data[at + 37:at + 41], 'little')
+            yield from ((at + 25, 8), (at + 37, 4), (at + 41 + name, 8))
+            inner, end = at + 49 + name, at + 9 + length
+            while not name and inner < end:
+                yield inner + 1, 8
+                inner += 9 + int.from_bytes(data[inner + 1:inner + 9], 'little')
+        at += 9 + length
+
+
+def flipped(data, chance):
+    """The file with one bit of a length changed; lengths of messages are the most."""
+    place, size = chance.choice(list(lengths(data)))
+    bit = chance.randrange(8 * size if chance.random() < 0.3 else 18)
+    changed = bytearray(data)
+    changed[place + bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('layout', LAYOUTS)
+def test_no_message_is_invented_where_a_length_is_wrong(tmp_path, layout):
+    """Sixty files with a bit of a length changed: no new message, and only the damaged ones go."""
+    path, bad = write(tmp_path / 'a.mcap', drive(), **LAYOUTS[layout]), tmp_path / 'b.mcap'
+    sound = [row[:6] for row in (
+        (m.topic, m.type, m.sequence, m.log_time, m.publish_time, m.data)
+        for m in Bag(path, strict=False).messages())]
+    lost, worst = 0, 0
+    for seed in range(60):
+        bad.write_bytes(flipped(path.read_bytes(), random.Random(seed)))
+        recover(bad, tmp_path / 'out.mcap')
+        rows = [row[:6] for row in contents(tmp_path / 'out.mcap')]
+        (tmp_path / 'out.mcap').unlink()
+        rest = iter(sound)
+        assert all(row in rest for row in rows), f'{seed}: a message that never was'
+        lost, worst = lost + len(sound) - len(rows), max(worst, len(sound) - len(rows))
+    print(f'{layout}: {lost} of {60 * len(sound)} messages lost, {worst} of a file')
+    assert lost <= 60 and worst <= 2
+
+
+def test_what_a_wrong_length_swallowed_is_told(tmp_path, capsys):
+    path = write(tmp_path / 'a.mcap', drive(), **LAYOUTS['chunks'])
+    data = bytearray(path.read_bytes())
+    chunk = [at for at, opcode, _ in records(data) if opcode == CHUNK][4]
+    at, message = chunk + 49, []
+    while len(message) < 2:
+        length = int.from_bytes(data[at + 1:at + 9], 'little')
+        message += [at] * (data[at] == 5)
+        at += 9 + length
+    data[message[0] + 1:message[0] + 9] = (at - message[0] - 9).to_bytes(8, 'little')  # of both
+    path.write_bytes(data)
+    assert cli.main(['bag', 'recover', str(path), str(tmp_path / 'out')]) == 0
+    told = capsys.readouterr().out
+    assert f'byte {message[0]}' in told and f'({message[1] - message[0]} bytes, 1 message' in told
+    assert 'lost messages: 1' in told and told.count('no checksums') == 1
+    assert len(contents(tmp_path / 'out')) == 179
+    with pytest.raises(BagError, match='counts'):
+        list(Bag(path).messages())
+    recover(write(tmp_path / 'b.mcap', drive()), tmp_path / 'sound')
+    assert 'no checksums' not in ' '.join(recover(tmp_path / 'sound', tmp_path / 'c').lines())
+
+
+def test_records_of_unknown_kinds_are_named(tmp_path):
+    path = write(tmp_path / 'a.mcap', drive(1.0))
+    data = path.read_bytes()
+    path.write_bytes(data[:data.index(b'\x06')] + b'\x99' + (5).to_bytes(8, 'little') + b'mine!'
+                     + data[data.index(b'\x06'):-37] + data[-37:-8])  # and no end
+    told = recover(path, tmp_path / 'out').lines()
+    assert any('0x99 (14 bytes)' in line for line in told)
+
+
+def test_the_distribution_and_the_data_of_the_source_are_kept(tmp_path):
+    folder = tmp_path / 'bag'
+    folder.mkdir()
+    write(folder / 'bag_0.mcap', drive(0.5))
+    (folder / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information:\n  relative_file_paths: [bag_0.mcap]\n'
+        '  ros_distro: humble\n  custom_data: {robot: "7", site: Köln}\n')
+    recover(folder, tmp_path / 'out')
+
+    def information(name):
+        return yaml.safe_load((tmp_path / name / 'metadata.yaml').read_text())[
+            'rosbag2_bagfile_information']
+    told = information('out')
+    assert told['ros_distro'] == 'humble'
+    assert told['custom_data'] == {'robot': '7', 'site': 'Köln'}
+    (folder / 'metadata.yaml').unlink()
+    recover(folder, tmp_path / 'bare')
+    assert information('bare')['ros_distro'] == 'unknown'

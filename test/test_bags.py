@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from vn_nav.bags.losses import Losses
 from vn_nav.bags.mcap_output import CHUNK, McapOutput
 from vn_nav.bags.reader import read_bag
 from vn_nav.bags.recorder import BagWriter, RecordingStopped
+from vn_nav.bags.stream import Bag
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 
@@ -149,6 +151,11 @@ def test_definitions_and_quality_of_service_are_as_rosbag2_has_them(tmp_path):
     assert facts['type_description_hash'].startswith('RIHS01_')
     assert (quality['durability'], quality['reliability'], quality['depth']) == (
         'transient_local', 'reliable', 1)
+    # A duration without end, as Jazzy has it (bags/ros2_bag_record was recorded by it).
+    jazzy = information(BAGS / 'ros2_bag_record')['topics_with_message_count'][0]
+    forever = jazzy['topic_metadata']['offered_qos_profiles'][0]['deadline']
+    assert quality['deadline'] == quality['lifespan'] == forever
+    assert quality['liveliness_lease_duration'] == forever
     with open(tmp_path / 'bag' / 'bag_0.mcap', 'rb') as file:
         reader = make_reader(file)
         assert reader.get_header().profile == 'ros2'
@@ -211,6 +218,91 @@ def test_every_second_what_has_come_is_in_the_file_and_the_folder_is_a_bag(tmp_p
             assert time.monotonic() < begun + 20
             time.sleep(0.05)
         assert not bag.stopped
+
+
+RECORDING = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from test_bags import START, TEXT, BagWriter, text, topic
+bag = BagWriter(sys.argv[2], [TEXT, topic('reward')])
+for number in range(10**9):
+    bag.write('scene', text(1000, number), START + number)
+    if number == 100:
+        bag.write('reward', bytes(8), START + number)
+    time.sleep(0.005)
+"""
+
+
+@pytest.mark.slow
+def test_of_a_killed_recording_the_metadata_says_what_is_in_it(tmp_path):
+    """`ros2 bag play` believes it: topics, counts and times, at most a second old."""
+    process = subprocess.Popen([sys.executable, '-c', RECORDING, str(Path(__file__).parent),
+                                str(tmp_path / 'bag')])
+    path, end = tmp_path / 'bag' / 'metadata.yaml', time.monotonic() + 60
+    try:
+        while not path.exists() or len(
+                information(tmp_path / 'bag')['topics_with_message_count']) < 2:
+            assert time.monotonic() < end and process.poll() is None
+            time.sleep(0.02)
+        time.sleep(1.5)
+    finally:
+        process.kill()
+        process.wait()
+    there = read_linearly(tmp_path / 'bag' / 'bag_0.mcap')
+    told = information(tmp_path / 'bag')
+    counts = {entry['topic_metadata']['name']: entry['message_count']
+              for entry in told['topics_with_message_count']}
+    assert counts['/reward'] == 1
+    assert 100 < sum(counts.values()) == told['message_count'] <= len(there)
+    assert told['files'][0]['message_count'] == told['message_count']
+    last = START + told['duration']['nanoseconds']
+    assert last == there[told['message_count'] - 1].log_time
+    assert [p.name for p in sorted((tmp_path / 'bag').iterdir()) if p.suffix != '.tmp'] == [
+        'bag_0.mcap', 'metadata.yaml']
+
+
+def chunk_by_chunk(path, count, look=lambda k: None):
+    """A file with a message a chunk, not finished."""
+    output = McapOutput(path)
+    channel = output.channel('/scene', TEXT.type, definition(TEXT.type)[0], {})
+    for k in range(count):
+        output.add(channel, text(10), START + k, k)
+        output.flush()
+        look(k)
+    return output
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_recorder_does_not_grow_with_its_chunks(tmp_path):
+    """800 bytes a chunk would be 175 MB an hour; the index is whole nevertheless."""
+    taken = {}
+
+    def look(k):
+        if k in (3000, 12_999):
+            taken[k] = tracemalloc.get_traced_memory()[0]
+    tracemalloc.start()
+    try:
+        output = chunk_by_chunk(tmp_path / 'a.mcap', 13_000, look)
+    finally:
+        tracemalloc.stop()
+    assert abs(taken[12_999] - taken[3000]) < 60 * 10_000
+    output.finish()
+    assert [path.name for path in tmp_path.iterdir()] == ['a.mcap']
+    with open(tmp_path / 'a.mcap', 'rb') as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert len(reader.get_summary().chunk_indexes) == 13_000
+        assert reader.get_summary().statistics.message_count == 13_000
+    assert [m.sequence for m in Bag(tmp_path / 'a.mcap').messages()] == list(range(13_000))
+
+
+@pytest.mark.slow
+def test_chunks_that_are_no_longer_in_memory_are_given_up_as_well(tmp_path):
+    """Where the summary of 5,000 small chunks needs the place of thousands."""
+    output = chunk_by_chunk(tmp_path / 'a.mcap', 5000)
+    with no_file_beyond(output.size + 1000):
+        output.finish()
+    numbers = [m.sequence for m in Bag(tmp_path / 'a.mcap').messages()]
+    assert numbers == list(range(len(numbers))) and 1000 < len(numbers) < 4000
 
 
 @pytest.mark.slow  # it waits for the time to pass

@@ -37,6 +37,8 @@ class BagFiles(NamedTuple):
 
     paths: list[Path]
     losses: list[Loss]  # what is not there, or not as metadata.yaml says
+    ros_distro: str | None = None  # as metadata.yaml has it
+    custom_data: dict[str, str] | None = None  # likewise: what the user wrote there
 
 
 def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
@@ -73,7 +75,7 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
             raise BagError(path, 'holds no MCAP file', rule=A_BAG, remedy=_elsewhere(path))
         return BagFiles(there, [])  # the files tell all; the recorder may have been killed before
     try:
-        listed = _listed(path, names)
+        information, listed = _listed(path, names)
     except OtherFormat:
         raise
     except BagError as error:
@@ -94,7 +96,7 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
                        f'with {whole}, or move the file elsewhere')
     return BagFiles([file for file in listed if file not in gone] + more, [
         *(Loss(file, 0, 0, 'the file is not there') for file in gone),
-        *(Loss(file, 0, 0, UNLISTED, harmless=True) for file in more)])
+        *(Loss(file, 0, 0, UNLISTED, harmless=True) for file in more)], *_origin(information))
 
 
 def load_yaml(text: str) -> Any:
@@ -128,8 +130,8 @@ def converted(source: str | Path) -> str:
             '--dst-storage mcap`')
 
 
-def _listed(folder: Path, names: list[str]) -> list[Path]:
-    """The files that metadata.yaml names, unpacked ones in place of compressed ones."""
+def _listed(folder: Path, names: list[str]) -> tuple[dict, list[Path]]:
+    """What metadata.yaml says, and the files that it names, unpacked in place of compressed."""
     path = folder / METADATA
     try:
         if path.stat().st_size > MAX_METADATA:
@@ -154,7 +156,16 @@ def _listed(folder: Path, names: list[str]) -> list[Path]:
         raise OtherFormat(path, f'its storage is {storage!r}', anew)
     listed = [twin if (twin := _unpacked(name)) in names else name for name in listed]
     _refuse_other_formats(folder, listed)
-    return [folder / name for name in listed]
+    return information, [folder / name for name in listed]
+
+
+def _origin(information: dict) -> tuple[str | None, dict[str, str] | None]:
+    """The ROS distribution and the user's own data of a bag; None: it does not say."""
+    distro, data = information.get('ros_distro'), information.get('custom_data')
+    whole = isinstance(data, dict) and all(
+        isinstance(word, (str, int, float)) for pair in data.items() for word in pair)
+    return (distro if isinstance(distro, str) and distro.isprintable() else None,
+            {str(key): str(value) for key, value in data.items()} if whole and data else None)
 
 
 def _refuse_other_formats(folder: Path, names: list[str], alone: bool = False) -> None:

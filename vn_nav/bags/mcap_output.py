@@ -11,8 +11,11 @@ from __future__ import annotations
 
 import collections
 import os
+import pickle
 import struct
+import tempfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,6 +40,7 @@ CHUNK = 256 * 1024  # bytes of records, or one message if that is larger
 LEVEL = 1  # of zstd
 MAGIC = b'\x89MCAP0\r\n'
 MESSAGE_HEAD = 31  # bytes of a message's record before its data
+KEPT = 512  # parts in memory, at least: what a full disk may take back at once
 
 
 class _Part(NamedTuple):
@@ -46,8 +50,60 @@ class _Part(NamedTuple):
     crc: int = 0  # of the file up to there
     span: tuple[int, int] | None = None  # least and greatest stamp up to there
     declared: tuple[Schema | Channel, ...] = ()
-    index: bytes = b''  # its record in the summary; bytes, as there may be hundreds of thousands
+    index: bytes = b''  # its record in the summary
     counts: tuple[tuple[int, int], ...] = ()  # channel, messages
+
+
+class _Parts:
+    """The parts of a file, the last ones in memory.
+
+    A picture is a chunk, and an hour has 220,000: the others wait in a nameless file in the same
+    folder, of which nothing is left when the recorder is killed.
+    """
+
+    def __init__(self, folder: Path):
+        self._folder, self._file = folder, None
+        self._last: list[_Part] = [_Part()]
+        self._blocks: list[tuple[int, int]] = []  # place and size of each `KEPT` before these
+
+    @property
+    def last(self) -> _Part:
+        return self._last[-1]
+
+    def push(self, part: _Part) -> None:
+        self._last.append(part)
+        if len(self._last) < 2 * KEPT:
+            return
+        block = zlib.compress(pickle.dumps([tuple(part) for part in self._last[:KEPT]]), 1)
+        place = sum(self._blocks[-1]) if self._blocks else 0
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)
+            if os.pwrite(self._file.fileno(), block, place) < len(block):
+                return
+        except OSError:  # a full disk, which the bag itself meets next; they stay in memory
+            return
+        self._blocks.append((place, len(block)))
+        del self._last[:KEPT]
+
+    def pop(self) -> _Part:
+        part = self._last.pop()
+        if not self._last:
+            self._last = self._block(*self._blocks.pop())
+        return part
+
+    def __iter__(self) -> Iterator[_Part]:
+        for block in self._blocks:
+            yield from self._block(*block)
+        yield from self._last
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def _block(self, place: int, size: int) -> list[_Part]:
+        data = os.pread(self._file.fileno(), size, place)
+        return [_Part(*values) for values in pickle.loads(zlib.decompress(data))]
 
 
 class McapOutput:
@@ -58,22 +114,25 @@ class McapOutput:
 
     Args:
         path: must not exist.
+        library: what writes it, for the header.
 
     Raises:
         OSError: the file cannot be made.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, library: str = 'vn_nav'):
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        self._parts = [_Part()]
+        self._parts = _Parts(path.parent)
+        self._known: list[Schema | Channel] = []  # in the parts
+        self._chunks = 0
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
-        self._schemas: dict[str, int] = {}  # id by type
+        self._schemas: dict[tuple[str, str, bytes], int] = {}  # ids
         self._channels = 0
         self._begin_chunk()
         self.counts: collections.Counter[int] = collections.Counter()  # in the file, by channel
         head = RecordBuilder()
         head.write(MAGIC)
-        Header('ros2', 'vn_nav').write(head)
+        Header('ros2', library).write(head)
         try:
             self._append(head.end(), _Part())
         except OSError:
@@ -84,14 +143,15 @@ class McapOutput:
     @property
     def size(self) -> int:
         """Bytes in the file, without the present chunk."""
-        return self._parts[-1].end
+        return self._parts.last.end
 
     @property
     def span(self) -> tuple[int, int] | None:
         """Least and greatest stamp in the file."""
-        return self._parts[-1].span
+        return self._parts.last.span
 
-    def channel(self, topic: str, kind: str, definition: str, metadata: dict[str, str]) -> int:
+    def channel(self, topic: str, kind: str, definition: str | bytes, metadata: dict[str, str],
+                *, encoding: str = 'cdr', schema: str = 'ros2msg') -> int:
         """Declare a channel, which needs a message in the same chunk; its id.
 
         Args:
@@ -99,17 +159,21 @@ class McapOutput:
             kind: package/msg/Type.
             definition: ros2msg text with all that the type is made of.
             metadata: of the channel.
+            encoding: of the messages.
+            schema: encoding of the definition.
         """
-        if kind not in self._schemas:
-            self._schemas[kind] = len(self._schemas) + 1
-            self._declare(Schema(id=self._schemas[kind], data=definition.encode(),
-                                 encoding='ros2msg', name=kind))
+        text = definition.encode() if isinstance(definition, str) else definition
+        key = kind, schema, text
+        if key not in self._schemas and any(key):  # else there is none: the number 0
+            self._schemas[key] = len(self._schemas) + 1
+            self._declare(Schema(id=self._schemas[key], data=text, encoding=schema, name=kind))
         self._channels += 1
-        self._declare(Channel(id=self._channels, topic=topic, message_encoding='cdr',
-                              metadata=metadata, schema_id=self._schemas[kind]))
+        self._declare(Channel(id=self._channels, topic=topic, message_encoding=encoding,
+                              metadata=metadata, schema_id=self._schemas.get(key, 0)))
         return self._channels
 
-    def add(self, channel: int, data: bytes, stamp: int, sequence: int = 0) -> None:
+    def add(self, channel: int, data: bytes, stamp: int, sequence: int = 0,
+            published: int | None = None) -> None:
         """Append a message; a chunk that is full, or would be overfull, is written.
 
         Args:
@@ -117,12 +181,14 @@ class McapOutput:
             data: CDR.
             stamp: ns since 1970.
             sequence: number that its publisher gave it.
+            published: ns since 1970; None: as `stamp`.
         """
         if self._index and self._chunk.count + MESSAGE_HEAD + len(data) > CHUNK:
             self.flush()
         index = self._index.setdefault(channel, MessageIndex(channel_id=channel, records=[]))
         index.records.append((stamp, self._chunk.count))
-        Message(channel_id=channel, log_time=stamp, data=data, publish_time=stamp,
+        Message(channel_id=channel, log_time=stamp, data=data,
+                publish_time=stamp if published is None else published,
                 sequence=sequence & 0xFFFFFFFF).write(self._chunk)
         if self._chunk.count >= CHUNK:
             self.flush()
@@ -137,7 +203,7 @@ class McapOutput:
         chunk = Chunk(compression='zstd', data=self._compressor.compress(records),
                       message_start_time=min(stamps), message_end_time=max(stamps),
                       uncompressed_crc=zlib.crc32(records), uncompressed_size=len(records))
-        last, builder = self._parts[-1], RecordBuilder()
+        last, builder = self._parts.last, RecordBuilder()
         chunk.write(builder)
         length, offsets = builder.count, {}
         for channel, index in indexes.items():
@@ -172,17 +238,25 @@ class McapOutput:
         """
         try:
             while True:
-                summary = self._summary()
+                end = self._parts.last.end
                 try:
-                    self._write(summary + bytes(spare))
+                    for piece in self._summary():
+                        end = self._write(piece, end)
+                    self._write(bytes(spare), end)
                     break
                 except OSError:
-                    if not self._give_up(len(summary) + spare):
+                    if not self._give_up(sum(map(len, self._summary())) + spare):
                         raise
-            os.truncate(self._file, self._parts[-1].end + len(summary))
+            os.truncate(self._file, end)
             os.fsync(self._file)
         finally:
+            self._parts.close()
             os.close(self._file)
+
+    def abandon(self) -> None:
+        """Close a file that shall not be finished."""
+        self._parts.close()
+        os.close(self._file)
 
     def _begin_chunk(self) -> None:
         self._chunk = RecordBuilder()
@@ -195,63 +269,76 @@ class McapOutput:
 
     def _append(self, data: bytes, part: _Part) -> None:
         """Write a part whose end and checksum are yet to be filled in."""
-        self._write(data)
-        last = self._parts[-1]
-        self._parts.append(part._replace(end=last.end + len(data),
-                                         crc=zlib.crc32(data, last.crc)))
+        last = self._parts.last
+        self._write(data, last.end)
+        self._parts.push(part._replace(end=last.end + len(data),
+                                       crc=zlib.crc32(data, last.crc)))
+        self._known += part.declared
+        self._chunks += bool(part.index)
 
-    def _write(self, data: bytes) -> None:
-        """Write behind the last part; if that fails, the file ends there."""
-        rest, offset = memoryview(data), self._parts[-1].end
+    def _write(self, data: bytes, offset: int) -> int:
+        """Write, and say where that ends; if it fails, the file ends with the last part."""
+        rest = memoryview(data)
         try:
             while rest:
                 count = os.pwrite(self._file, rest, offset)
                 rest, offset = rest[count:], offset + count
         except OSError:
-            os.truncate(self._file, self._parts[-1].end)
+            os.truncate(self._file, self._parts.last.end)
             raise
+        return offset
 
     def _give_up(self, size: int) -> bool:
         """Drop chunks from the end that take so many bytes; whether there was one."""
-        end, dropped = self._parts[-1].end, False
-        while self._parts[-1].index and end - self._parts[-1].end < size:
-            self.counts.subtract(dict(self._parts.pop().counts))
+        end, dropped = self._parts.last.end, False
+        while self._parts.last.index and end - self._parts.last.end < size:
+            part = self._parts.pop()
+            self.counts.subtract(dict(part.counts))
+            del self._known[len(self._known) - len(part.declared):]
+            self._chunks -= 1
             dropped = True
-        os.truncate(self._file, self._parts[-1].end)
+        os.truncate(self._file, self._parts.last.end)
         return dropped
 
-    def _summary(self) -> bytes:
-        """From the end of the data to the end of the file."""
-        last, builder = self._parts[-1], RecordBuilder()
-        declared = [record for part in self._parts for record in part.declared]
-        schemas = [record for record in declared if isinstance(record, Schema)]
-        channels = [record for record in declared if isinstance(record, Channel)]
-        chunks = [part.index for part in self._parts if part.index]
+    def _summary(self) -> Iterator[bytes]:
+        """From the end of the data to the end of the file, piece by piece."""
+        last, builder = self._parts.last, RecordBuilder()
+        schemas = [record for record in self._known if isinstance(record, Schema)]
+        channels = [record for record in self._known if isinstance(record, Channel)]
         counts = {channel: count for channel, count in self.counts.items() if count}
         first, latest = last.span or (0, 0)
         statistics = Statistics(
             message_count=sum(counts.values()), schema_count=len(schemas),
             channel_count=len(channels), attachment_count=0, metadata_count=0,
-            chunk_count=len(chunks), message_start_time=first, message_end_time=latest,
+            chunk_count=self._chunks, message_start_time=first, message_end_time=latest,
             channel_message_counts=counts)
         DataEnd(last.crc).write(builder)
         data_end = builder.end()
-        start, offsets = last.end + len(data_end), []
+        yield data_end
+        start = at = last.end + len(data_end)
+        crc, offsets = 0, []
         for opcode, group in ((Opcode.SCHEMA, schemas), (Opcode.CHANNEL, channels),
-                              (Opcode.STATISTICS, [statistics]), (Opcode.CHUNK_INDEX, chunks)):
-            begin = builder.count
+                              (Opcode.STATISTICS, [statistics])):
             for record in group:
-                if isinstance(record, bytes):
-                    builder.write(record)
-                else:
-                    record.write(builder)
+                record.write(builder)
             if group:
-                offsets.append(SummaryOffset(opcode, start + begin, builder.count - begin))
-        offset_start = start + builder.count
+                offsets.append(SummaryOffset(opcode, at, builder.count))
+            piece = builder.end()
+            at, crc = at + len(piece), zlib.crc32(piece, crc)
+            yield piece
+        begin = at
+        for part in self._parts:
+            at, crc = at + len(part.index), zlib.crc32(part.index, crc)
+            builder.write(part.index)
+            if builder.count >= CHUNK:
+                yield builder.end()
+        yield builder.end()
+        if at > begin:
+            offsets.append(SummaryOffset(Opcode.CHUNK_INDEX, begin, at - begin))
         for offset in offsets:
             offset.write(builder)
-        summary = builder.end()
+        piece = builder.end()
         # The checksum of the summary covers the footer up to the checksum's own place.
-        crc = zlib.crc32(summary + struct.pack('<BQQQ', Opcode.FOOTER, 20, start, offset_start))
-        Footer(start, offset_start, crc).write(builder)
-        return data_end + summary + builder.end() + MAGIC
+        crc = zlib.crc32(piece + struct.pack('<BQQQ', Opcode.FOOTER, 20, start, at), crc)
+        Footer(start, at, crc).write(builder)
+        yield piece + builder.end() + MAGIC

@@ -21,7 +21,7 @@ from vn_nav.errors import UserError
 (HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT,
  ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END) = range(1, 16)
 A_BAG = 'a bag is a folder with metadata.yaml and MCAP files, or one MCAP file'
-PRIVATE = 0x80  # and above: records of applications, which every reader passes over
+UNKNOWN = 0x10  # and above: of later versions, or (from 0x80) of applications; passed over
 # A chunk of rosbag2 has 768 KiB; a picture at the cap of `vn_msgs_py.images` has 192 MB at most
 # (16 million pixels of twelve bytes). What is larger is no recording of a robot's cameras.
 MAX_RECORD = 256 << 20  # bytes of a message, or of a chunk, compressed or not
@@ -30,10 +30,12 @@ MAX_NAME = 1024  # bytes of the name of a topic or type; ROS allows 255
 MAX_TIME = 2**63 - 1  # ns: the year 2262, and what rosbag2's own times can hold
 
 HEAD = struct.Struct('<BQ')  # opcode, length
-_MESSAGE = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
+MESSAGE_FIELDS = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
 _CHUNK = struct.Struct('<QQQI')  # start, end, size, CRC
 # Bytes that a byte can stand for at most: a block of 128 KiB in 4 bytes; a match of 255 bytes.
 _MOST = {'zstd': 1 << 15, 'lz4': 255}
+# Kinds that would hide messages, a message that is too short, and what is no kind at all.
+NEVER_IN_CHUNKS = (0, MESSAGE, CHUNK, DATA_END, FOOTER)
 OVERHEAD = 256  # bytes of memory that a channel takes beside its texts
 
 
@@ -81,11 +83,17 @@ class Message(NamedTuple):
 
 
 class Damage(Exception):
-    """What is wrong at a place; `whole`: where the record ends can be believed."""
+    """What is wrong at a place.
 
-    def __init__(self, fault: str, *, whole: bool = False, cost: int = 0):
+    Args:
+        fault: in words.
+        end: where the record ends nevertheless, if that is believed.
+        cost: bytes that were read to find out.
+    """
+
+    def __init__(self, fault: str, *, end: int | None = None, cost: int = 0):
         super().__init__(fault)
-        self.fault, self.whole, self.cost = fault, whole, cost
+        self.fault, self.end, self.cost = fault, end, cost
 
 
 class Fields:
@@ -126,6 +134,8 @@ class Fields:
 class Declared:
     """The schemas and channels of a file as they come by.
 
+    A channel may come before its schema: summaries repeat channels, and not always schemas.
+
     Args:
         path: of the file.
         wanted: whether the messages of a topic are asked for.
@@ -134,16 +144,28 @@ class Declared:
     def __init__(self, path: Path, wanted: Callable[[str], bool]):
         self._path, self._wanted, self._size = path, wanted, 0
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
-        self.channels: dict[int, Connection] = {}
+        self._declared: dict[int, tuple] = {}  # schema, topic, encoding, metadata of a channel
+        self._waiting: dict[int, list[int]] = {}  # channels whose schema has not come, by schema
+        self.channels: dict[int, Connection] = {}  # whose schema has come
         self.chosen: dict[int, Connection | None] = {}  # None: not asked for
+
+    @property
+    def whole(self) -> bool:
+        """Whether every channel has its schema."""
+        return not self._waiting
+
+    def __contains__(self, channel: int) -> bool:
+        return channel in self._declared
 
     def schema(self, fields: Fields) -> None:
         number, = fields.numbers('<H')
+        if number == 0:  # invalid, and to be ignored, as the specification has it
+            return
         schema = fields.text(name=True), fields.text(name=True), fields.data()
-        if number == 0:
-            raise Damage('a schema has the number 0')
         if self._schemas.setdefault(number, schema) is schema:
             self._grow(sum(map(len, schema)))
+            for channel in self._waiting.pop(number, ()):
+                self._settle(channel)
         elif self._schemas[number] != schema:
             raise Damage(f'schema {number} ({schema[0]}) is declared twice, and differently')
 
@@ -153,24 +175,45 @@ class Declared:
         pairs, metadata = Fields(fields.data()), []
         while pairs.left:
             metadata.append((pairs.text(), pairs.text()))
+        channel = schema, topic, encoding, tuple(sorted(metadata))
+        if self._declared.setdefault(number, channel) is not channel:
+            if self._declared[number] != channel:
+                raise Damage(f'channel {number} ({topic}) is declared twice, and differently')
+            return
+        self._grow(len(topic) + sum(len(a) + len(b) for a, b in metadata) + OVERHEAD)
+        if not self._wanted(topic):
+            self.chosen[number] = None
         if schema and schema not in self._schemas:
-            raise Damage(f'the channel of {topic} has schema {schema}, which nothing declares')
-        name, *definition = self._schemas.get(schema, ('', '', b''))
-        connection = Connection(self._path, topic, name, encoding, *definition,
-                                tuple(sorted(metadata)))
-        if self.channels.setdefault(number, connection) is connection:
-            self._grow(len(topic) + sum(len(a) + len(b) for a, b in metadata) + OVERHEAD)
-            self.chosen[number] = connection if self._wanted(topic) else None
-        elif self.channels[number] != connection:
-            raise Damage(f'channel {number} ({topic}) is declared twice, and differently')
+            self._waiting.setdefault(schema, []).append(number)
+        else:
+            self._settle(number)
 
     def again(self, wanted: Callable[[str], bool]) -> Declared:
         """The same declarations, with other topics asked for."""
         copy = Declared(self._path, wanted)
         copy._size, copy._schemas = self._size, dict(self._schemas)
-        copy.channels = dict(self.channels)
-        copy.chosen = {k: c if wanted(c.topic) else None for k, c in self.channels.items()}
+        copy._declared, copy.channels = dict(self._declared), dict(self.channels)
+        copy._waiting = {schema: list(numbers) for schema, numbers in self._waiting.items()}
+        for number, (_, topic, *_) in self._declared.items():
+            if not wanted(topic):
+                copy.chosen[number] = None
+            elif number in self.channels:
+                copy.chosen[number] = self.channels[number]
         return copy
+
+    def unknown(self, channel: int) -> str:
+        """What is wrong with a message of a channel that is not in `chosen`."""
+        if channel not in self._declared:
+            return f'a message is of channel {channel}, which nothing declares'
+        schema, topic, *_ = self._declared[channel]
+        return f'the channel of {topic} has schema {schema}, which nothing declares'
+
+    def _settle(self, number: int) -> None:
+        schema, topic, encoding, metadata = self._declared[number]
+        name, *definition = self._schemas.get(schema, ('', '', b''))
+        connection = Connection(self._path, topic, name, encoding, *definition, metadata)
+        self.channels[number] = connection
+        self.chosen.setdefault(number, connection)
 
     def _grow(self, size: int) -> None:
         self._size += size
@@ -191,38 +234,66 @@ def pairs(fields: Fields) -> bytes:
     return data
 
 
-def chunk_fields(body: bytes, length: int) -> tuple[int, int, int, int, str, int]:
-    """Start, end [ns], size, CRC and compression of a chunk, and where its records begin."""
+class ChunkHead(NamedTuple):
+    """What a chunk says of its records."""
+
+    span: tuple[int, int]  # ns, of the first and last message; (0, 0) where it has none
+    size: int  # bytes of the records
+    crc: int  # of them; 0: unknown
+    compression: str
+    at: int  # where they begin in the chunk's body
+    stored: int  # bytes that they take there
+
+
+def chunk_head(body: bytes) -> ChunkHead:
+    """The fields of a chunk before its records; what it declares is not compared yet."""
     fields = Fields(body)
     start, end, size, crc = fields.numbers(_CHUNK)
     compression = fields.text(name=True)
     stored, = fields.numbers('<Q')
-    if stored != length - fields.at:
-        raise Damage(f'a chunk declares {stored} bytes and has {length - fields.at}')
+    return ChunkHead((start, end), size, crc, compression, fields.at, stored)
+
+
+def unpacked(body: bytes) -> tuple[bytes, ChunkHead]:
+    """The records of a chunk. Fields that a later version appended are passed over."""
+    head = chunk_head(body)
+    left = len(body) - head.at - head.stored
+    if left < 0:
+        raise Damage(f'a chunk declares {head.stored} bytes and has {left + head.stored}')
+    if left >= HEAD.size and begins_record(body[-left:]):
+        raise Damage('a chunk goes on behind its records, over other records of the file')
+    return unpack(memoryview(body)[head.at:head.at + head.stored], head), head
+
+
+def begins_record(data: bytes) -> bool:
+    """Whether bytes look like a record that may follow a chunk."""
+    opcode, length = HEAD.unpack_from(data)
+    return opcode in (CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END, SCHEMA, CHANNEL,
+                      MESSAGE) and length < 1 << 40
+
+
+def unpack(stored: memoryview, head: ChunkHead) -> bytes:
+    """The records of a chunk out of the bytes that it stores them in."""
+    size, cost = head.size, len(stored) + head.size
     if size > MAX_RECORD:
-        raise Damage(f'a chunk declares {size} bytes, more than {MAX_RECORD}', whole=True)
-    return start, end, size, crc, compression, fields.at
-
-
-def unpacked(body: bytes) -> tuple[bytes, tuple[int, int]]:
-    """The records of a chunk, and the time [ns] of its first and last message."""
-    start, end, size, crc, compression, at = chunk_fields(body, len(body))
-    stored, cost = memoryview(body)[at:], len(body) + size
+        raise Damage(f'a chunk declares {size} bytes, more than {MAX_RECORD}')
     try:
-        data = _inflate(stored, compression, size)
+        data = _inflate(stored, head.compression, size)
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
-        raise Damage(f'a chunk cannot be decompressed ({compression}): {words(error)}',
-                     whole=True, cost=cost) from error
+        raise Damage(f'a chunk cannot be decompressed ({head.compression}): {words(error)}',
+                     cost=cost) from error
     if len(data) != size:
-        raise Damage(f'a chunk declares {size} bytes and holds another number', whole=True,
-                     cost=cost)
-    if crc and zlib.crc32(data) != crc:
-        raise Damage('the checksum of a chunk does not match', whole=True, cost=cost)
-    return data, (start, end)
+        raise Damage(f'a chunk declares {size} bytes and holds another number', cost=cost)
+    if head.crc and zlib.crc32(data) != head.crc:
+        raise Damage('the checksum of a chunk does not match', cost=cost)
+    return data
 
 
 def _inflate(stored: memoryview, compression: str, size: int) -> bytes:
-    """The `size` bytes that a chunk declares; never takes memory for more."""
+    """The `size` bytes that a chunk declares; never takes memory for more.
+
+    They may be in several frames; what is behind these is nobody's.
+    """
     if compression == '':
         return bytes(stored)
     if size > _MOST.get(compression, size) * len(stored):
@@ -230,33 +301,39 @@ def _inflate(stored: memoryview, compression: str, size: int) -> bytes:
     if compression == 'zstd':
         # The frame's own size, if it has one, goes before max_output_size.
         declared = zstandard.frame_content_size(stored)
-        if declared not in (-1, size):
+        if declared > size:
             raise ValueError(f'the frame declares {declared} bytes, the chunk {size}')
-        return zstandard.ZstdDecompressor().decompress(
-            stored, max_output_size=max(size, 1), allow_extra_data=False)
+        data = zstandard.ZstdDecompressor().decompress(stored, max_output_size=max(size, 1))
+        if len(data) >= size:
+            return data
+        with zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True) as whole:
+            return whole.read(size + 1)
     if compression == 'lz4':
-        decompressor = lz4.frame.LZ4FrameDecompressor()
-        data = decompressor.decompress(stored, max_length=size + 1)
-        if not decompressor.eof or decompressor.unused_data:
-            raise ValueError('the frame is not complete, or not alone')
-        return data
+        parts = []
+        while size > 0 or not parts:
+            decompressor = lz4.frame.LZ4FrameDecompressor()
+            parts.append(decompressor.decompress(stored, max_length=size + 1))
+            if not decompressor.eof:
+                raise ValueError('the frame is not complete')
+            size, stored = size - len(parts[-1]), decompressor.unused_data or b''
+        return b''.join(parts)
     raise ValueError('the compression is zstd, lz4 or none')
 
 
 def records(data: bytes, declared: Declared) -> Iterator[Message]:
     """The messages that are asked for among records; declarations are noted."""
-    at, end, chosen, size = 0, len(data), declared.chosen, _MESSAGE.size
+    at, end, chosen, size = 0, len(data), declared.chosen, MESSAGE_FIELDS.size
     while at < end:
         if data[at] == MESSAGE and end - at >= size:
-            _, length, channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, at)
+            _, length, channel, sequence, log_time, publish_time = (
+                MESSAGE_FIELDS.unpack_from(data, at))
             at += size
             stop = at + length - (size - HEAD.size)
             if not at <= stop <= end or log_time > MAX_TIME or publish_time > MAX_TIME:
                 raise Damage(f'a message declares {length} bytes and the times {log_time} and '
-                             f'{publish_time} ns', whole=True)
+                             f'{publish_time} ns')
             if channel not in chosen:
-                raise Damage(f'a message is of channel {channel}, which nothing declares',
-                             whole=True)
+                raise Damage(declared.unknown(channel))
             connection = chosen[channel]
             if connection is not None:
                 yield Message(connection, sequence, log_time, publish_time, data[at:stop])
@@ -264,9 +341,8 @@ def records(data: bytes, declared: Declared) -> Iterator[Message]:
             continue
         fields = Fields(data, at)
         opcode, length = fields.numbers(HEAD)
-        if length > fields.left or opcode not in (SCHEMA, CHANNEL) and opcode < PRIVATE:
-            raise Damage(f'a chunk holds a record of kind {opcode} with {length} bytes',
-                         whole=True)
+        if length > fields.left or opcode in NEVER_IN_CHUNKS:
+            raise Damage(f'a chunk holds a record of kind {opcode} with {length} bytes')
         at = fields.at + length
         if opcode in (SCHEMA, CHANNEL):
             fields = Fields(data[fields.at:at])

@@ -5,7 +5,9 @@ from __future__ import annotations
 import collections
 import dataclasses
 import errno
+import functools
 import os
+import textwrap
 import threading
 import time
 from collections.abc import Iterable
@@ -22,7 +24,8 @@ from vn_nav.errors import UserError
 FLUSH = 1.0  # s between flushes: what a power cut may cost
 MIN_FREE = 1_000_000_000  # bytes
 WAITING = 64 << 20  # bytes that may wait for the disk before `write` does
-_FOREVER = {'sec': 2147483647, 'nsec': 4294967295}
+SOON = 0.1  # s to the flush after the first message of a topic: metadata.yaml is to name it
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}  # as Jazzy writes a duration without end
 
 
 class RecordingStopped(UserError):
@@ -57,13 +60,15 @@ class _File:
     name: str
     span: tuple[int, int] | None = None  # least and greatest stamp
     counts: collections.Counter[_Channel] = dataclasses.field(default_factory=collections.Counter)
+    text: str = ''  # once it is finished
 
 
 class BagWriter:
     """A bag being recorded; a context manager.
 
     A thread of its own compresses and writes, so that a slow disk does not hold up who calls. It
-    writes what has come every second, also to the disk itself, and every full chunk at once. When
+    writes what has come every second, also to the disk itself and with a metadata.yaml that counts
+    it, and every full chunk at once. When
     less than `min_free` is left, or writing fails, it finishes the bag and `stopped` says why.
     A topic is in the bag from its first message on.
 
@@ -89,6 +94,7 @@ class BagWriter:
         for topic in topics:
             self.add(topic)
         self._files: list[_File] = []
+        self._before: collections.Counter[_Channel] = collections.Counter()  # in finished files
         self._file: McapOutput | None = None
         self._queue: collections.deque[_Waiting] = collections.deque()
         self._bytes = 0  # in the queue
@@ -169,17 +175,19 @@ class BagWriter:
 
     def _work(self) -> None:
         """The thread: never raises."""
-        due = time.monotonic() + FLUSH
+        self._due, told = time.monotonic() + FLUSH, 0
         try:
-            while (item := self._take(due)) or not self._closing:
+            while (item := self._take(self._due)) or not self._closing:
                 if item:
                     self._put(item)
-                if time.monotonic() >= due:
+                if time.monotonic() >= self._due:
                     self._file.flush()
                     self._file.sync()
                     self._count()
                     self._check_room()
-                    due = time.monotonic() + FLUSH
+                    if told != (told := self.written.total()):
+                        self._write_metadata()
+                    self._due = time.monotonic() + FLUSH
             self._file.flush()
         except Exception as error:  # also a bug must not leave writers waiting for ever
             self._stop(error)
@@ -218,6 +226,7 @@ class BagWriter:
                 channel.name, channel.topic.type, channel.definition,
                 {'offered_qos_profiles': _yaml([_quality(channel.topic)]),
                  'topic_type_hash': channel.digest})
+            self._due = min(self._due, time.monotonic() + SOON)
         self._file.add(self._channels[channel], item.data, item.stamp, item.sequence)
 
     def _stop(self, error: Exception) -> None:
@@ -241,7 +250,7 @@ class BagWriter:
         self._file, self._begun = McapOutput(path), time.monotonic()
         self._channels: dict[_Channel, int] = {}  # ids in the present file
         self._files.append(_File(path.name))
-        self._write_metadata()
+        self._write_metadata(folder=True)
 
     def _end_file(self, spare: int = 0) -> None:
         file = self._file
@@ -250,7 +259,10 @@ class BagWriter:
         finally:
             self._count()
             self._file = None
-        self._write_metadata()
+            ended = self._files[-1]
+            ended.text = _file_text(ended)
+            self._before += ended.counts
+        self._write_metadata(folder=True)
 
     def _count(self) -> None:
         """Look at what the present file holds."""
@@ -265,10 +277,15 @@ class BagWriter:
         self.written = written
 
     def _counts(self) -> collections.Counter[_Channel]:
-        return sum((file.counts for file in self._files), collections.Counter())
+        present = self._files[-1]
+        return self._before + (collections.Counter() if present.text else present.counts)
 
-    def _write_metadata(self) -> None:
-        """Replace metadata.yaml: whole at any moment, so that a killed recording is a bag."""
+    def _write_metadata(self, *, folder: bool = False) -> None:
+        """Replace metadata.yaml: whole at any moment, so that a killed recording is a bag.
+
+        Args:
+            folder: have the disk hold the names of the files as well.
+        """
         path = self.folder / 'metadata.yaml'
         partial = path.with_suffix('.yaml.tmp')
         try:
@@ -280,36 +297,34 @@ class BagWriter:
         except OSError:
             partial.unlink(missing_ok=True)
             raise
-        folder = os.open(self.folder, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # the names in it
-        finally:
-            os.close(folder)
+        if folder:
+            names = os.open(self.folder, os.O_RDONLY)
+            try:
+                os.fsync(names)
+            finally:
+                os.close(names)
 
     def _describe(self) -> str:
-        """The text of metadata.yaml (rosbag2_storage, metadata version 9)."""
+        """The text of metadata.yaml (rosbag2_storage, metadata version 9).
+
+        Written every second: what stays the same is text already, as a dumper would take a
+        hundred times as long.
+        """
         spans = [file.span for file in self._files if file.span]
-        information = {
-            'version': 9,
-            'storage_identifier': 'mcap',
-            **_times((min(first for first, _ in spans), max(last for _, last in spans))
-                     if spans else None),
-            'message_count': self._counts().total(),
-            'topics_with_message_count': [
-                {'topic_metadata': {'name': channel.name, 'type': channel.topic.type,
-                                    'serialization_format': 'cdr',
-                                    'offered_qos_profiles': [_quality(channel.topic)],
-                                    'type_description_hash': channel.digest},
-                 'message_count': count} for channel, count in self._counts().items()],
-            'compression_format': '',  # of chunks: rosbag2 leaves that to MCAP
-            'compression_mode': '',
-            'relative_file_paths': [file.name for file in self._files],
-            'files': [{'path': file.name, **_times(file.span),
-                       'message_count': file.counts.total()} for file in self._files],
-            'custom_data': None,
-            'ros_distro': 'jazzy',
-        }
-        return _yaml({'rosbag2_bagfile_information': information})
+        span = (min(first for first, _ in spans),
+                max(last for _, last in spans)) if spans else None
+        counts = self._counts()
+        topics = [f'{_topic_text(channel)}      message_count: {count}\n'
+                  for channel, count in counts.items()]
+        return ''.join((
+            'rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: mcap\n',
+            _times_text(span, '  '), f'  message_count: {counts.total()}\n',
+            '  topics_with_message_count:', '\n' if topics else ' []\n', *topics,
+            # Of chunks: rosbag2 leaves that to MCAP.
+            "  compression_format: ''\n  compression_mode: ''\n", '  relative_file_paths:\n',
+            *(f'    - {_scalar(file.name)}\n' for file in self._files), '  files:\n',
+            *(file.text or _file_text(file) for file in self._files),
+            '  custom_data: null\n  ros_distro: jazzy\n'))
 
 
 class _NoAliases(yaml.SafeDumper):
@@ -323,10 +338,29 @@ def _yaml(data: object) -> str:
     return yaml.dump(data, Dumper=_NoAliases, sort_keys=False, width=1000)
 
 
-def _times(span: tuple[int, int] | None) -> dict:
+@functools.cache
+def _scalar(text: str) -> str:
+    """A text as YAML has it, in quotes where it needs them."""
+    return _yaml([text]).removeprefix('- ').strip()
+
+
+@functools.cache
+def _topic_text(channel: _Channel) -> str:
+    return textwrap.indent(_yaml([{'topic_metadata': {
+        'name': channel.name, 'type': channel.topic.type, 'serialization_format': 'cdr',
+        'offered_qos_profiles': [_quality(channel.topic)],
+        'type_description_hash': channel.digest}}]), '    ')
+
+
+def _file_text(file: _File) -> str:
+    return (f'    - path: {_scalar(file.name)}\n{_times_text(file.span, "      ")}'
+            f'      message_count: {file.counts.total()}\n')
+
+
+def _times_text(span: tuple[int, int] | None, indent: str) -> str:
     first, last = span or (0, 0)
-    return {'duration': {'nanoseconds': last - first},
-            'starting_time': {'nanoseconds_since_epoch': first}}
+    return (f'{indent}duration:\n{indent}  nanoseconds: {last - first}\n'
+            f'{indent}starting_time:\n{indent}  nanoseconds_since_epoch: {first}\n')
 
 
 def _quality(topic: Topic) -> dict:

@@ -9,14 +9,13 @@ import shutil
 from pathlib import Path
 
 import yaml
-from mcap.writer import CompressionType, Writer
 
 from vn_nav.bags.mcap_input import Loss
+from vn_nav.bags.mcap_output import McapOutput
 from vn_nav.bags.mcap_records import BagError, Connection
 from vn_nav.bags.stream import METADATA, Bag, load_yaml
 from vn_nav.errors import UserError
 
-CHUNK = 256 * 1024  # bytes of records, as the recorder writes them
 MAX_QUALITY = 16 << 10  # bytes of a channel's QoS profiles that are taken over
 
 
@@ -29,6 +28,7 @@ class Recovered:
     span: tuple[int, int]  # ns, of the first and the last message
     losses: list[Loss]
     missing: int | None  # messages that the files counted and that are not there; None: unknown
+    notes: list[str]  # what is no damage
 
     @property
     def lost(self) -> bool:
@@ -39,12 +39,15 @@ class Recovered:
         """The account in words, a line each."""
         seconds = (self.span[1] - self.span[0]) * 1e-9
         return [f'{self.target}: {sum(self.counts.values())} messages of {len(self.counts)} '
-                f'topics, {seconds:.1f} s', *map(self._line, self.losses), self._lost()]
+                f'topics, {seconds:.1f} s', *(f'note: {note}' for note in self.notes),
+                *map(self._line, self.losses), self._lost()]
 
     def _line(self, loss: Loss) -> str:
         stretch = f'{loss.size} bytes' if loss.size else ''
         if loss.chunks:
             stretch += f', {loss.chunks} chunk' + 's' * (loss.chunks > 1)
+        if loss.messages:
+            stretch += f', {loss.messages} message' + 's' * (loss.messages > 1)
         if loss.size and None not in (loss.before, loss.after):
             stretch += ', {:.2f} to {:.2f} s from the start'.format(
                 *((time - self.span[0]) * 1e-9 for time in (loss.before, loss.after)))
@@ -90,7 +93,7 @@ def recover(source: str | Path, target: str | Path) -> Recovered:
         if not counts:
             raise BagError(source, 'no message in it is whole', remedy='it is lost')
         if not single:
-            text = yaml.safe_dump(_metadata(file.name, counts, span), sort_keys=False)
+            text = yaml.safe_dump(_metadata(file.name, counts, span, bag), sort_keys=False)
             (partial / METADATA).write_text(text)
         partial.rename(target)
     except OSError as error:
@@ -101,40 +104,36 @@ def recover(source: str | Path, target: str | Path) -> Recovered:
     by_topic: collections.Counter[str] = collections.Counter()
     for connection, count in counts.items():
         by_topic[connection.topic] += count
-    return Recovered(target, dict(by_topic), span, bag.losses, bag.missing)
+    return Recovered(target, dict(by_topic), span, bag.losses, bag.missing, bag.notes)
 
 
 def _copy(bag: Bag, file: Path) -> tuple[dict[Connection, int], tuple[int, int]]:
     """Write the messages of a bag; their number by channel, and their span [ns]."""
     numbers: dict[Connection, int] = {}  # several files of a bag, and of one channel
-    schemas: dict[tuple[str, str, bytes], int] = {}
     counts: collections.Counter[Connection] = collections.Counter()
     first, last = 1 << 63, 0
-    with open(file, 'xb') as stream:
-        writer = Writer(stream, chunk_size=CHUNK, compression=CompressionType.ZSTD,
-                        enable_data_crcs=True)
-        writer.start('ros2', 'vn_nav bag recover')
+    output = McapOutput(file, 'vn_nav bag recover')
+    try:
         for message in bag.messages():
             channel = message.connection._replace(path=bag.path)
             if channel not in numbers:
-                schema = channel.type, channel.schema_encoding, channel.definition
-                if channel.type and schema not in schemas:
-                    schemas[schema] = writer.register_schema(*schema)
-                numbers[channel] = writer.register_channel(
-                    channel.topic, channel.encoding, schemas.get(schema, 0),
-                    dict(channel.metadata))
-            writer.add_message(numbers[channel], message.log_time, message.data,
-                               message.publish_time, message.sequence)
+                numbers[channel] = output.channel(
+                    channel.topic, channel.type, channel.definition, dict(channel.metadata),
+                    encoding=channel.encoding, schema=channel.schema_encoding)
+            output.add(numbers[channel], message.data, message.log_time, message.sequence,
+                       message.publish_time)
             counts[channel] += 1
             first, last = min(first, message.log_time), max(last, message.log_time)
-        writer.finish()
-        stream.flush()
-        os.fsync(stream.fileno())
+        output.flush()
+    except BaseException:
+        output.abandon()
+        raise
+    output.finish()
     return dict(counts), (first, last)
 
 
-def _metadata(name: str, counts: dict[Connection, int], span: tuple[int, int]) -> dict:
-    """What metadata.yaml says (rosbag2, version 9)."""
+def _metadata(name: str, counts: dict[Connection, int], span: tuple[int, int], bag: Bag) -> dict:
+    """What metadata.yaml says (rosbag2, version 9); the distribution is that of the source."""
     def times() -> dict:  # twice the same object would become an alias
         return {'duration': {'nanoseconds': span[1] - span[0]},
                 'starting_time': {'nanoseconds_since_epoch': span[0]}}
@@ -151,7 +150,7 @@ def _metadata(name: str, counts: dict[Connection, int], span: tuple[int, int]) -
              'message_count': count} for channel, count in counts.items()],
         'compression_format': '', 'compression_mode': '', 'relative_file_paths': [name],
         'files': [{'path': name, **times(), 'message_count': total}],
-        'custom_data': None, 'ros_distro': 'jazzy'}}
+        'custom_data': bag.custom_data, 'ros_distro': bag.ros_distro or 'unknown'}}
 
 
 def _quality(channel: Connection) -> list:

@@ -7,6 +7,7 @@ or not what it says, is a `BagError`; with `strict=False` it is passed over and 
 
 from __future__ import annotations
 
+import collections
 import heapq
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -49,15 +50,20 @@ class Bag:
         strict: damage is an error. Otherwise it is passed over; `losses` and `missing` tell of it
             after reading.
 
+    Attributes:
+        ros_distro, custom_data: as metadata.yaml has them; None: it does not say.
+
     Raises:
         BagError: no bag, one in another format, or (if strict) one that was not finished.
     """
 
     def __init__(self, path: str | Path, *, strict: bool = True):
         self.path, self._reading, self.files = Path(path), 0, []
-        paths, self._own = files_of(path, strict=strict)
+        found = files_of(path, strict=strict)
+        self._own = list(found.losses)
+        self.ros_distro, self.custom_data = found.ros_distro, found.custom_data
         unreadable: BagError | None = None
-        for file in paths:
+        for file in found.paths:
             try:
                 self.files.append(McapFile(file, strict=strict))
             except BagError as error:
@@ -78,6 +84,21 @@ class Bag:
         """Messages that the files count and that were not read; None: a file does not count."""
         known = [file.missing for file in self.files]
         return None if None in known else sum(known)
+
+    @property
+    def notes(self) -> list[str]:
+        """What is no damage and worth knowing, after reading with `strict=False`."""
+        notes, passed = [], collections.Counter()
+        if without := sum(file.unchecked > 0 for file in self.files):
+            which = f'{without} of {len(self.files)} files have' if len(self.files) > 1 else (
+                f'{self.files[0].path} has')
+            notes.append(f'{which} no checksums: what changed within a message cannot be known')
+        for file in self.files:
+            passed.update(file.passed)
+        if passed:
+            notes.append('left out are records of kinds that are not known here: ' + ', '.join(
+                f'{kind:#04x} ({size} bytes)' for kind, size in sorted(passed.items())))
+        return notes
 
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[Message]:
         """The messages in the order of the files.

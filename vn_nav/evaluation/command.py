@@ -118,7 +118,7 @@ def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) 
     """
     from vn_nav.evaluation import evaluator, tables
     from vn_nav.evaluation.evaluation_page import evaluation_page
-    from vn_nav.policy.checkpoint import write_file
+    from vn_nav.files import write_file
     result = {
         'checkpoint': str(args.checkpoint), 'sha256': info['sha256'],
         'bag': args.bag.name if args.bag else None,

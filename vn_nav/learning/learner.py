@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from vn_nav.errors import UserError
+from vn_nav.files import write_file
 from vn_nav.learning import auxiliary
 from vn_nav.learning.distributed import Processes
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.returns import generalised_advantages, masked_mean
 from vn_nav.learning.rollout import Rollout
 from vn_nav.observation import Observation
-from vn_nav.policy.checkpoint import write_file
 from vn_nav.policy.network import IMAGE_HEADS, Policy, RecurrentState
 
 # Tasks whose weight is a field of `LearnerConfig`. The first three learn from the replay memory.

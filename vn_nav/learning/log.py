@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vn_nav.errors import UserError
+from vn_nav.files import write_file
 from vn_nav.learning.presets import TrainConfig
 from vn_nav.learning.state_file import written
-from vn_nav.policy.checkpoint import write_file
 
 METRICS, TENSORBOARD = 'metrics.csv', 'tensorboard'
 

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.files import write_file
 from vn_nav.learning.hindsight import Drives, Split, draw_windows, partners, rows_of
 from vn_nav.learning.log import METRICS
 from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
@@ -32,7 +33,7 @@ from vn_nav.learning.supervised import (
     Objective,
     Tally,
 )
-from vn_nav.policy.checkpoint import save_checkpoint, write_file
+from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network import IMAGE_HEADS, Policy
 
 STATE, CHECKPOINT = 'pretrain_state', 'checkpoint'

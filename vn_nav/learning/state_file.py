@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from vn_nav.errors import UserError
-from vn_nav.policy.checkpoint import write_file
+from vn_nav.files import write_file
 
 
 def write_state(path: Path, state: dict) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 
 from vn_nav.evaluation import evaluator, tables
 from vn_nav.evaluation.evaluation_page import evaluation_page
+from vn_nav.files import write_file
 from vn_nav.learning.stages import Stages
-from vn_nav.policy.checkpoint import write_file
 from vn_nav.policy.network import Policy
 from vn_nav.robot import RobotSpec
 

@@ -41,8 +41,9 @@ import torch
 from torch import Tensor, nn
 
 from vn_nav.errors import UserError
+from vn_nav.files import write_file
 from vn_nav.observation import Observation
-from vn_nav.policy.checkpoint import LoadedCheckpoint, write_file
+from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
 
