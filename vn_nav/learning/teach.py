@@ -129,7 +129,7 @@ def _config(args: argparse.Namespace, given: LoadedCheckpoint | None, minutes: f
                 'track_goal': bool(network.moves), **{name: getattr(network, name) for name in (
                     'architecture', 'channels', 'blocks', 'features', 'hidden', 'deconvolutions',
                     'pose_to_memory', 'pixel_mean', 'pixel_std')}}
-    words = [f'{name}={value!r}' for name, value in own.items()]
+    words = [f'{name}={value}' for name, value in own.items()]
     return train_config(argparse.Namespace(**dict.fromkeys(CHANGES) | {
         'preset': PRESET, 'set': [*words, *args.set], 'seed': args.seed, 'no_tensorboard': True,
         'threads': args.threads}))
