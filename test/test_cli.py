@@ -18,6 +18,13 @@ def run(*words):
                           capture_output=True, text=True, timeout=100)
 
 
+def _config(folder):
+    """What config.json says, to be changed on purpose: without its checksum."""
+    config = json.loads((folder / CONFIG).read_text())
+    del config['config_sha256']
+    return config
+
+
 @pytest.mark.parametrize('words, expected', [
     (['evaluate', '/nowhere'], 'checkpoint'),
     (['evaluate', 'models/house', '--episodes', '0'], 'episode'),
@@ -57,7 +64,7 @@ def test_the_process_ends_with_that_line_and_exit_code_2():
 
 def test_another_world_version_is_refused_with_the_remedy(tmp_path, capsys):
     folder = write_checkpoint(tmp_path / 'model', size=36)
-    config = (folder / CONFIG).read_text()
+    config = json.dumps(_config(folder))
     (folder / CONFIG).write_text(config.replace(f'"world_version": "{WORLD_VERSION}"',
                                                 '"world_version": "0"'))
     for words in (['evaluate', str(folder)],
@@ -83,7 +90,7 @@ def test_evaluate_prints_figures(tmp_path, capsys):
 
 def test_a_policy_of_recorded_pictures_is_measured_in_houses_that_are_named(tmp_path, capsys):
     folder = write_checkpoint(tmp_path / 'model', size=36)
-    config = json.loads((folder / CONFIG).read_text())
+    config = _config(folder)
     config |= {'world_version': 'recorded', 'houses': [], 'rooms': None}
     (folder / CONFIG).write_text(json.dumps(config))
     words = ['evaluate', str(folder), '--house', '7', '--episodes', '1', '--max-decisions', '2',
@@ -110,7 +117,7 @@ def test_evaluate_by_split_and_house(tmp_path, capsys):
 
 def test_a_house_of_the_training_is_not_held_out(tmp_path, capsys):
     folder = write_checkpoint(tmp_path / 'model', size=36)
-    config = json.loads((folder / CONFIG).read_text()) | {'houses': [10_001]}
+    config = _config(folder) | {'houses': [10_001]}
     (folder / CONFIG).write_text(json.dumps(config))
     assert main(['evaluate', str(folder), '--split', 'validation']) == 2
     message = capsys.readouterr().err
@@ -119,7 +126,7 @@ def test_a_house_of_the_training_is_not_held_out(tmp_path, capsys):
 
 def test_a_task_without_goals_has_fewer_controls(tmp_path):
     folder = write_checkpoint(tmp_path / 'model', size=36)
-    config = json.loads((folder / CONFIG).read_text()) | {'task': 'collect', 'objects': 4}
+    config = _config(folder) | {'task': 'collect', 'objects': 4}
     (folder / CONFIG).write_text(json.dumps(config))
     figures = tmp_path / 'figures.json'
     assert main(['evaluate', str(folder), '--episodes', '2', '--max-decisions', '5',
