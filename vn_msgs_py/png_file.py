@@ -77,6 +77,8 @@ def examine_png(data: bytes) -> PngFile:
                 raise _damaged('a PNG has IHDR, then PLTE, before its pixels', f'byte {at}')
             header.append(data[at:end + 4])
         elif kind == b'IEND':
+            if data[at:at + 12] != END:
+                raise _truncated(f'{data[at:at + 12]!r} for an end chunk')
             break
         elif kind == b'eXIf':
             orientation = read_orientation(data[begin:end])
@@ -159,16 +161,17 @@ def _inflate(data: bytes, png: PngFile) -> tuple[list[bytes], bytes]:
     The checksum is not compared here: whoever uses the rows does.
     """
     size, view = _inflated_bytes(png), memoryview(data)
-    start, stop = png.pixels[0]
-    first = bytes(view[start:min(start + 2, stop)])
-    if len(first) < 2 or first[0] & 15 != 8 or first[1] & 32 or int.from_bytes(first) % 31:
-        raise _damaged("a PNG's pixels are a zlib stream in an IDAT chunk", first)
-    stream, parts, left, after = zlib.decompressobj(-zlib.MAX_WBITS), [], size, b''
+    stream, parts, left = zlib.decompressobj(-zlib.MAX_WBITS), [], size
+    head = after = b''  # of the zlib stream: two bytes before what is inflated, four behind it
     try:
-        for begin, end in ((start + 2, stop), *png.pixels[1:]):
+        for begin, end in png.pixels:
+            if len(head) < 2:
+                begin, head = begin + 2 - len(head), head + view[begin:end][:2 - len(head)]
+                if begin >= end:
+                    continue
             if stream.eof:
-                after += view[begin:min(begin + 4, end)]
-            elif begin < end:
+                after += view[begin:end][:4]
+            else:
                 parts.append(stream.decompress(view[begin:end], left + 1))
                 left -= len(parts[-1])
                 if left < 0:
@@ -179,6 +182,8 @@ def _inflate(data: bytes, png: PngFile) -> tuple[list[bytes], bytes]:
                 break
     except zlib.error as error:
         raise _damaged("a PNG's pixels can be inflated", str(error)) from error
+    if len(head) < 2 or head[0] & 15 != 8 or head[1] & 32 or int.from_bytes(head, 'big') % 31:
+        raise _damaged('the pixels of a PNG are a zlib stream', head)
     if left or len(after) < 4:
         raise _truncated(f'{size - left} of {size} bytes of pixels')
     return parts, after[:4]
