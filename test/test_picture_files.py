@@ -21,10 +21,12 @@ import numpy as np
 import picture_bytes
 import pytest
 from picture_bytes import chunk, encoded, jpeg, photo, png, segment, with_exif
+from small_bags import START, make, write
 
 from vn_msgs_py.image_error import ForeignFormatError, ImageError
 from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.picture_file import decode_picture
+from vn_nav.bags.doctor import diagnose
 from vn_nav.goal_picture import KEPT_SIDE_PX, MAX_JPEG_PX
 
 MUTATIONS = int(os.environ.get('VN_NAV_PICTURE_MUTATIONS', 3000))
@@ -186,6 +188,14 @@ def test_a_mosaic_in_a_compressed_picture_is_no_grey_picture(pattern, red, blue)
 def test_other_formats_are_named(data, name):
     with pytest.raises(ForeignFormatError, match=name):
         decode_picture(data)
+
+
+def test_the_doctor_of_bags_names_a_hostile_picture(tmp_path):
+    kind = 'sensor_msgs/msg/CompressedImage'
+    bomb = np.frombuffer(png(8, 8, picture_bytes.zeros(200, 20 << 20)), np.uint8)
+    sent = [('/image_raw/compressed', kind, START, make(kind, format='png', data=bomb))]
+    findings = diagnose(write(tmp_path / 'a.mcap', sent)).findings
+    assert any('the pixels of 8 x 8 in a PNG are 200 bytes' in f.what for f in findings), findings
 
 
 def test_jpegs_that_a_camera_may_write_are_read():

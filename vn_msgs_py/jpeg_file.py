@@ -24,6 +24,7 @@ EXIF = b'Exif\0\0'
 BASELINE, EXTENDED, PROGRESSIVE = 0xC0, 0xC1, 0xC2
 OTHER_FRAMES = {0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF, 0xDE}
 SOI, EOI, SOS, APP1 = 0xD8, 0xD9, 0xDA, 0xE1
+TABLES = {0xC4, 0xDB, 0xDD, 0xE0, 0xE2, 0xFE}  # Huffman, quantisation, restarts, JFIF, ICC, comment
 ALONE = {0x01, *range(0xD0, 0xD8)}  # markers without a segment
 
 
@@ -137,6 +138,9 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
                            f'segment {segments} at byte {at}: {marker:#04x}, {length}')
         if at + 2 + length > len(data):
             raise _truncated(f'a segment of {length} bytes at byte {at} of {len(data)}')
+        if marker in TABLES:  # the decoder's business
+            at += 2 + length
+            continue
         body = data[at + 4:at + 2 + length]
         at += 2 + length
         if marker in (BASELINE, EXTENDED, PROGRESSIVE):
