@@ -42,11 +42,33 @@ def test_rgb_is_read_as_it_stands():
 
 @pytest.mark.parametrize('name, convert', [
     ('bgr8', cv2.COLOR_RGB2BGR), ('rgba8', cv2.COLOR_RGB2RGBA), ('bgra8', cv2.COLOR_RGB2BGRA),
-    ('8UC3', cv2.COLOR_RGB2BGR),
+    ('8UC3', cv2.COLOR_RGB2BGR), ('8UC4', cv2.COLOR_RGB2BGRA),
 ])
 def test_channel_orders_come_back_as_rgb(picture, name, convert):
     message = images.fill_image(SimpleNamespace(), cv2.cvtColor(picture, convert), name)
     assert np.array_equal(decode_rgb(message), picture)
+
+
+@pytest.mark.parametrize('big', [False, True])
+@pytest.mark.parametrize('name, convert', [
+    ('rgb16', None), ('bgr16', cv2.COLOR_RGB2BGR), ('rgba16', cv2.COLOR_RGB2RGBA),
+    ('bgra16', cv2.COLOR_RGB2BGRA), ('16UC3', cv2.COLOR_RGB2BGR), ('16UC4', cv2.COLOR_RGB2BGRA),
+])
+def test_sixteen_bits_a_channel_keep_the_upper_eight(picture, name, convert, big):
+    deep = picture.astype(np.uint16) * 256 + 77
+    deep = deep if convert is None else cv2.cvtColor(deep, convert)
+    message = image(height=16, width=24, step=24 * 2 * deep.shape[2], encoding=name,
+                    is_bigendian=int(big), data=deep.astype('>u2' if big else '<u2').tobytes())
+    assert np.array_equal(decode_rgb(message), picture)
+
+
+def test_every_encoding_of_jazzy_that_carries_colour_is_known():
+    # sensor_msgs/image_encodings.hpp; signed, 32- and 64-bit ones say nothing of colour.
+    assert {'rgb8', 'rgba8', 'rgb16', 'rgba16', 'bgr8', 'bgra8', 'bgr16', 'bgra16', 'mono8',
+            'mono16', '8UC1', '8UC3', '8UC4', '16UC3', '16UC4', 'yuv422', 'uyvy', 'yuv422_yuy2',
+            'yuyv', 'nv21', 'nv24', *(f'bayer_{pattern}{bits}' for bits in (8, 16)
+                                      for pattern in ('rggb', 'bggr', 'gbrg', 'grbg'))
+            } <= set(images.COLOUR)
 
 
 def test_grey_becomes_three_equal_channels(picture):
@@ -68,9 +90,15 @@ def test_bayer_patterns_put_red_where_it_belongs(name, red, blue):
     mosaic[blue[0]::2, blue[1]::2] = 30
     message = image(height=16, width=16, step=16, encoding=name, data=mosaic.tobytes())
     assert np.abs(decode_rgb(message)[4:12, 4:12].astype(int) - [200, 100, 30]).max() <= 1
+    deep = image(height=16, width=16, step=32, encoding=f'{name[:-1]}16',
+                 data=(mosaic.astype('<u2') * 256 + 99).tobytes())
+    assert np.array_equal(decode_rgb(deep), decode_rgb(message))
 
 
-@pytest.mark.parametrize('name, order', [('yuv422', (1, 0, 3, 2)), ('yuv422_yuy2', (0, 1, 2, 3))])
+@pytest.mark.parametrize('name, order', [
+    ('yuv422', (1, 0, 3, 2)), ('uyvy', (1, 0, 3, 2)), ('yuv422_yuy2', (0, 1, 2, 3)),
+    ('yuyv', (0, 1, 2, 3)),
+])
 def test_packed_yuv(name, order):
     # One flat colour: Y 120, U 90, V 200 in BT.601 is a strong red.
     row = np.array([120, 90, 120, 200], np.uint8)[list(order)]
@@ -86,6 +114,22 @@ def test_semi_planar_yuv(name):
     planes = np.concatenate([np.full((4, 4), 120), np.tile(chroma, (2, 2))]).astype(np.uint8)
     rgb = decode_rgb(image(height=4, width=4, step=4, encoding=name, data=planes.tobytes()))
     assert rgb.shape == (4, 4, 3) and rgb[0, 0, 0] > 200 and rgb[0, 0, 2] < 90
+
+
+@pytest.mark.parametrize('padding', [0, 3])
+def test_semi_planar_yuv_of_full_resolution(padding):
+    """Of V4L2's NV24 a chroma row takes two steps; each pixel has a colour of its own."""
+    chance = np.random.default_rng(0)
+    luma, chroma = (chance.integers(16, 236, size, np.uint8) for size in ((3, 5), (3, 5, 2)))
+    rows = np.zeros((9, 5 + padding), np.uint8)
+    rows[:3, :5] = luma
+    rows[3:].reshape(3, -1)[:, :10] = chroma.reshape(3, 10)
+    rgb = decode_rgb(image(height=3, width=5, step=5 + padding, encoding='nv24',
+                           data=rows.tobytes()))
+    y, u, v = luma - 16.0, chroma[..., 0] - 128.0, chroma[..., 1] - 128.0
+    right = np.stack([1.164 * y + 1.596 * v, 1.164 * y - 0.813 * v - 0.391 * u,
+                      1.164 * y + 2.018 * u], axis=2).clip(0, 255)
+    assert rgb.shape == (3, 5, 3) and np.abs(rgb - right).max() <= 2
 
 
 def test_padding_at_the_end_of_rows_is_dropped(picture):
@@ -205,5 +249,7 @@ def test_fill_refuses_what_is_no_such_picture(picture):
         images.fill_image(SimpleNamespace(), picture.astype(np.float32), 'rgb8')
     with pytest.raises(ImageError):
         images.fill_image(SimpleNamespace(), picture, 'nv12')
+    with pytest.raises(ImageError):
+        images.fill_image(SimpleNamespace(), picture[:, :, 0], 'nv24')
     message = images.fill_image(SimpleNamespace(), picture, 'rgb8')
     assert message.is_bigendian == int(sys.byteorder == 'big')

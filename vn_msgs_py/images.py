@@ -7,21 +7,14 @@ is an `ImageError`, never a crash, a huge allocation or a wrong picture.
 from __future__ import annotations
 
 import array
-import struct
 import sys
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-MAX_PIXELS = 16_000_000  # a 389 kB PNG can otherwise claim gigabytes
-
-
-class ImageError(ValueError):
-    """A picture that cannot be used: states the rule, the value received and the remedy."""
-
-    def __init__(self, rule: str, received: object, remedy: str):
-        super().__init__(f'{rule}; received {received!r}; {remedy}')
+from vn_msgs_py.image_error import ImageError, check_size
+from vn_msgs_py.picture_file import decode_picture
 
 
 class Encoding(NamedTuple):
@@ -30,33 +23,42 @@ class Encoding(NamedTuple):
     dtype: type
     channels: int  # values per pixel in a row of `step` bytes; 4:2:2 has two
     to_rgb: int | None  # OpenCV conversion of the [H,W,channels] array; None: no colour picture
-    planes: float = 1.0  # rows of the array per picture row (semi-planar 4:2:0 has 1.5)
+    planes: float = 1.0  # rows of the array per picture row (semi-planar: 4:2:0 1.5, 4:4:4 3)
 
 
+# All of `sensor_msgs/image_encodings` that carry colour or grey. What cv_bridge gives to 8UC3,
+# 8UC4 and the like is in OpenCV's order, BGR. Of 16 bits the upper 8 are kept.
 ENCODINGS = {
     'rgb8': Encoding(np.uint8, 3, None),
     'bgr8': Encoding(np.uint8, 3, cv2.COLOR_BGR2RGB),
     'rgba8': Encoding(np.uint8, 4, cv2.COLOR_RGBA2RGB),
     'bgra8': Encoding(np.uint8, 4, cv2.COLOR_BGRA2RGB),
+    'rgb16': Encoding(np.uint16, 3, None),
+    'bgr16': Encoding(np.uint16, 3, cv2.COLOR_BGR2RGB),
+    'rgba16': Encoding(np.uint16, 4, cv2.COLOR_RGBA2RGB),
+    'bgra16': Encoding(np.uint16, 4, cv2.COLOR_BGRA2RGB),
     'mono8': Encoding(np.uint8, 1, cv2.COLOR_GRAY2RGB),
     'mono16': Encoding(np.uint16, 1, cv2.COLOR_GRAY2RGB),
     '8UC1': Encoding(np.uint8, 1, cv2.COLOR_GRAY2RGB),
-    '8UC3': Encoding(np.uint8, 3, cv2.COLOR_BGR2RGB),  # cv_bridge's meaning of 8UC3 is BGR
+    '8UC3': Encoding(np.uint8, 3, cv2.COLOR_BGR2RGB),
+    '8UC4': Encoding(np.uint8, 4, cv2.COLOR_BGRA2RGB),
+    '16UC3': Encoding(np.uint16, 3, cv2.COLOR_BGR2RGB),
+    '16UC4': Encoding(np.uint16, 4, cv2.COLOR_BGRA2RGB),
     '16UC1': Encoding(np.uint16, 1, None),
     '32FC1': Encoding(np.float32, 1, None),
     'yuv422': Encoding(np.uint8, 2, cv2.COLOR_YUV2RGB_UYVY),
+    'uyvy': Encoding(np.uint8, 2, cv2.COLOR_YUV2RGB_UYVY),
     'yuv422_yuy2': Encoding(np.uint8, 2, cv2.COLOR_YUV2RGB_YUY2),
+    'yuyv': Encoding(np.uint8, 2, cv2.COLOR_YUV2RGB_YUY2),
     'nv12': Encoding(np.uint8, 1, cv2.COLOR_YUV2RGB_NV12, 1.5),
     'nv21': Encoding(np.uint8, 1, cv2.COLOR_YUV2RGB_NV21, 1.5),
+    'nv24': Encoding(np.uint8, 1, cv2.COLOR_YUV2RGB_YUY2, 3.0),
     # OpenCV names a Bayer pattern by its second row's second and third pixel.
-    'bayer_rggb8': Encoding(np.uint8, 1, cv2.COLOR_BayerBG2RGB),
-    'bayer_bggr8': Encoding(np.uint8, 1, cv2.COLOR_BayerRG2RGB),
-    'bayer_gbrg8': Encoding(np.uint8, 1, cv2.COLOR_BayerGR2RGB),
-    'bayer_grbg8': Encoding(np.uint8, 1, cv2.COLOR_BayerGB2RGB),
+    **{f'bayer_{pattern}{bits}': Encoding(dtype, 1, code)
+       for bits, dtype in ((8, np.uint8), (16, np.uint16))
+       for pattern, code in (('rggb', cv2.COLOR_BayerBG2RGB), ('bggr', cv2.COLOR_BayerRG2RGB),
+                             ('gbrg', cv2.COLOR_BayerGR2RGB), ('grbg', cv2.COLOR_BayerGB2RGB))},
 }
-# Parts of a JPEG's size that it can be decoded to (libjpeg scales its inverse transform).
-REDUCED = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4,
-           8: cv2.IMREAD_REDUCED_COLOR_8}
 COLOUR = tuple(name for name in ENCODINGS if name not in ('16UC1', '32FC1'))
 DEPTH = ('16UC1', 'mono16', '32FC1')
 LABELS = ('mono8', '8UC1', '16UC1', 'mono16')
@@ -78,15 +80,32 @@ def decode_rgb(message: Any, smallest: int | None = None) -> np.ndarray:
         return _decompress(message, smallest)
     raw = _raw_array(message, COLOUR)
     encoding = ENCODINGS[message.encoding]
-    if message.encoding == 'rgb8':
-        return np.ascontiguousarray(raw)
-    if message.encoding == 'mono16':
+    if message.encoding == 'nv24':
+        raw = _yuyv_of_nv24(message, raw)
+    if raw.dtype == np.uint16:
         raw = (raw >> 8).astype(np.uint8)
+    if encoding.to_rgb is None:
+        return np.ascontiguousarray(raw)
     try:
-        return cv2.cvtColor(np.ascontiguousarray(raw), encoding.to_rgb)
+        picture = cv2.cvtColor(np.ascontiguousarray(raw), encoding.to_rgb)
     except cv2.error as error:
         raise ImageError(f'a {message.encoding} picture has a size that its layout allows',
                          (message.height, message.width), 'check the camera driver') from error
+    return picture[:, ::2].copy() if message.encoding == 'nv24' else picture
+
+
+def _yuyv_of_nv24(message: Any, rows: np.ndarray) -> np.ndarray:
+    """Each pixel of 4:4:4 as two of 4:2:2, [H,2W,2]: OpenCV has no conversion of nv24 itself.
+
+    Args:
+        message: the picture.
+        rows: [3H,step], padding kept: a row of its chroma plane takes two.
+    """
+    height, width = int(message.height), int(message.width)
+    luma = rows[:height, :width]
+    chroma = rows[height:].reshape(height, -1)[:, :2 * width].reshape(height, width, 2)
+    return np.stack([luma, chroma[..., 0], luma, chroma[..., 1]], axis=2).reshape(
+        height, 2 * width, 2)
 
 
 def decode_depth(message: Any) -> np.ndarray:
@@ -111,8 +130,8 @@ def _raw_array(message: Any, allowed: tuple[str, ...]) -> np.ndarray:
                          'convert it with image_proc, or set the camera driver')
     encoding = ENCODINGS[name]
     height, width, step = int(message.height), int(message.width), int(message.step)
-    _check_size(height, width)
-    if encoding.planes != 1.0 and (height % 2 or width % 2):
+    check_size(height, width)
+    if encoding.planes == 1.5 and (height % 2 or width % 2):
         raise ImageError(f'{name} pictures have even sides', (height, width),
                          'check the camera driver')
     if encoding.channels == 2 and width % 2:
@@ -126,7 +145,10 @@ def _raw_array(message: Any, allowed: tuple[str, ...]) -> np.ndarray:
     if len(message.data) != step * rows:
         raise ImageError(f'data has step x rows = {step * rows} bytes', len(message.data),
                          'the message is truncated or mislabelled: check the camera driver')
-    data = np.frombuffer(message.data, np.uint8).reshape(rows, step)[:, :row_bytes]
+    data = np.frombuffer(message.data, np.uint8).reshape(rows, step)
+    if encoding.planes == 3.0:
+        return data  # two of its rows of padding may lie together
+    data = data[:, :row_bytes]
     if item > 1:
         data = np.ascontiguousarray(data).view(encoding.dtype)
         if bool(message.is_bigendian) != (sys.byteorder == 'big'):
@@ -136,73 +158,18 @@ def _raw_array(message: Any, allowed: tuple[str, ...]) -> np.ndarray:
     return data
 
 
-def _check_size(height: int, width: int) -> None:
-    if height < 1 or width < 1:
-        raise ImageError('a picture has at least one pixel', (height, width),
-                         'check the camera driver')
-    if height * width > MAX_PIXELS:
-        raise ImageError(f'a picture has at most {MAX_PIXELS} pixels', (height, width),
-                         'lower the resolution of the camera')
-
-
 def _decompress(message: Any, smallest: int | None) -> np.ndarray:
-    data = bytes(message.data)
-    kind = str(message.format).lower()
-    if 'compresseddepth' in kind:
+    words = str(message.format).lower()
+    if 'compresseddepth' in words:
         raise ImageError('a compressed picture is JPEG or PNG', message.format,
                          'republish depth as raw (image_transport republish)')
-    scale = 1
-    if data[:3] == b'\xff\xd8\xff':
-        size, complete = _jpeg_size(data), data.rstrip(b'\0')[-2:] == b'\xff\xd9'
-    elif data[:8] == b'\x89PNG\r\n\x1a\n':
-        size, complete = _png_size(data), data[-8:-4] == b'IEND'
-    else:
-        raise ImageError('a compressed picture is JPEG or PNG', (message.format, data[:8]),
-                         'set the format of the camera driver to jpeg or png')
-    _check_size(*size)
-    if not complete:
-        raise ImageError('a compressed picture is complete to its end marker',
-                         f'{len(data)} bytes without one', 'the message is truncated: check the '
-                         'network and the camera driver')
-    if smallest is not None and data[:3] == b'\xff\xd8\xff':
-        scale = max((k for k in REDUCED if min(size) // k >= smallest), default=1)
-    try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), REDUCED.get(scale, cv2.IMREAD_COLOR))
-    except cv2.error as error:
-        raise ImageError('a compressed picture can be decoded', str(error).splitlines()[0],
-                         'check the camera driver') from error
-    if picture is None or picture.shape[:2] != tuple(-(-side // scale) for side in size):
-        raise ImageError('a compressed picture can be decoded', f'{len(data)} bytes',
-                         'the data is damaged: check the camera driver')
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-
-
-def _png_size(data: bytes) -> tuple[int, int]:
-    if len(data) < 33 or data[12:16] != b'IHDR':
-        raise ImageError('a PNG begins with its header', data[:16], 'check the camera driver')
-    width, height = struct.unpack('>II', data[16:24])
-    return height, width
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Height and width from the start-of-frame segment (ITU-T T.81, B.2.2)."""
-    at = 2
-    while at + 9 <= len(data):
-        if data[at] != 0xFF:
-            break
-        marker = data[at + 1]
-        if marker == 0xFF:  # fill byte
-            at += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack('>HH', data[at + 5:at + 9])
-            return height, width
-        if marker in (0x01, *range(0xD0, 0xD9)):
-            at += 2
-            continue
-        at += 2 + struct.unpack('>H', data[at + 2:at + 4])[0]
-    raise ImageError('a JPEG has a frame header', f'{len(data)} bytes without one',
-                     'the data is damaged: check the camera driver')
+    # image_transport: '<encoding>; jpeg compressed <encoding of the file>'
+    name = words.partition(';')[0].strip()
+    if name in ('16uc1', '32fc1'):
+        raise ImageError('a compressed picture is grey or colour', message.format,
+                         'name the topic of the camera, not of its depth')
+    mosaic = ENCODINGS[name].to_rgb if name.startswith('bayer_') and name in ENCODINGS else None
+    return decode_picture(bytes(message.data), smallest=smallest, mosaic=mosaic)
 
 
 def fill_image(message: Any, picture: np.ndarray, encoding: str = 'rgb8') -> Any:
@@ -227,7 +194,7 @@ def fill_image(message: Any, picture: np.ndarray, encoding: str = 'rgb8') -> Any
             picture.dtype != layout.dtype):
         raise ImageError(f'{encoding} is {np.dtype(layout.dtype)} with {layout.channels} channels',
                          f'{picture.dtype} {picture.shape}', 'convert the array')
-    _check_size(*picture.shape[:2])
+    check_size(*picture.shape[:2])
     message.height, message.width = picture.shape[:2]
     message.encoding = encoding
     message.is_bigendian = int(sys.byteorder == 'big')

@@ -1,0 +1,86 @@
+"""Goal pictures as people bring them: from phones, too large, in other formats."""
+
+import cv2
+import numpy as np
+import picture_bytes
+import pytest
+from picture_bytes import encoded, jpeg, photo, png, with_exif, zeros
+
+from vn_nav import goal_picture
+from vn_nav.errors import UserError
+from vn_nav.goal_picture import read_goal_picture
+
+
+def refused(path, *words):
+    with pytest.raises(UserError) as caught:
+        read_goal_picture(path)
+    text = str(caught.value)
+    assert '\n' not in text and 'goal picture' in text and path.name in text, text
+    for word in words:
+        assert word in text, text
+
+
+@pytest.mark.parametrize('suffix', ['.jpg', '.png'])
+def test_a_phone_held_upright(tmp_path, suffix):
+    path = tmp_path / f'goal{suffix}'
+    stored = encoded(photo(480, 640), suffix)
+    path.write_bytes(with_exif(stored, 6) + b'SEFT' * 100)
+    plain = cv2.imdecode(np.frombuffer(stored, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert np.array_equal(read_goal_picture(path), np.rot90(plain, -1))
+
+
+def test_small_ones_are_read_whole(tmp_path):
+    path = tmp_path / 'goal.png'
+    path.write_bytes(encoded(photo(1999, 40), '.png'))
+    assert np.array_equal(read_goal_picture(path), photo(1999, 40))
+    path.write_bytes(encoded(photo(1300, 1900), '.jpg'))
+    assert read_goal_picture(path).shape == (1300, 1900, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('width, height, shape', [
+    (4000, 3000, (1500, 2000, 3)), (8000, 6000, (1500, 2000, 3)), (16320, 12240, (1530, 2040, 3)),
+    (30_000, 1500, (750, 15_000, 3))])  # the last one fits at a half only
+def test_large_jpegs_are_decoded_at_a_part_of_their_size(tmp_path, width, height, shape):
+    path = tmp_path / 'goal.jpg'
+    path.write_bytes(jpeg(width, height, marker=0xC0))
+    assert read_goal_picture(path).shape == shape
+
+
+def test_what_is_too_large_is_refused_with_the_command(tmp_path):
+    path = tmp_path / 'my goal.png'
+    path.write_bytes(png(8000, 6000, zeros(8000)))
+    refused(path, '(6000, 8000)', f"convert '{path}'", '-resize')
+    path = tmp_path / 'goal.jpg'
+    path.write_bytes(jpeg(30_000, 30_000, marker=0xC0, data=bytes(9)))
+    refused(path, '(30000, 30000)', '-resize')
+
+
+def test_a_file_without_end_is_not_read_to_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(goal_picture, 'MAX_FILE_BYTES', 1000)
+    path = tmp_path / 'goal.png'
+    path.write_bytes(encoded(photo(), '.png'))
+    refused(path, '1000 bytes')
+
+
+def test_other_formats_are_named_with_the_command(tmp_path):
+    path = tmp_path / 'IMG 1.HEIC'
+    path.write_bytes(b'\0\0\0\x24ftypheic\0\0\0\0mif1MiHBheic')
+    refused(path, 'HEIC', f"`convert '{path}' '{path.with_suffix('.jpg')}'`", 'pillow-heif')
+    path = tmp_path / 'goal.jpg'  # the name says nothing
+    path.write_bytes(b'RIFF\0\0\0\0WEBPVP8 ')
+    refused(path, 'WebP', 'convert')
+
+
+@pytest.mark.parametrize('name', ['a gigabyte behind the rows of a small PNG', 'two frame headers',
+                                  'a chunk length of 4 GB, before the pixels'])
+def test_hostile_ones_are_one_line(tmp_path, name):
+    path = tmp_path / 'goal.png'
+    path.write_bytes({
+        'a gigabyte behind the rows of a small PNG': png(8, 8, zeros(200, 100 << 20)),
+        'two frame headers': jpeg(8, 8, extra=picture_bytes.frame(4000, 4000)),
+        'a chunk length of 4 GB, before the pixels': (
+            encoded(photo(), '.png')[:33] + picture_bytes.chunk(b'tEXt', b'a', 2**32 - 2**20)),
+    }[name])
+    refused(path)
+    refused(tmp_path, 'no such file')
