@@ -4,7 +4,8 @@
 #   make demo      watch a robot drive to the places of pictures, in simulation, over ROS 2
 #   make test      the fast tests (under 5 minutes)
 #   make test-all  every test (under 40 minutes)
-#   make soak      kill trainings at 200 random moments, read 50,000 damaged bags (an hour)
+#   make soak      faults by the hundred: killed trainings, damaged bags and pictures, lost cameras,
+#                  signals, an hour of driving (three hours in all)
 #   make lint      ruff, and the linters of ROS
 #   make clean     remove what was built: the environment, caches, the demonstration's output
 #
@@ -54,6 +55,8 @@ soak: $(READY)
 	@VN_NAV_KILLS=200 $(BIN)/python -m pytest test/test_survival.py test/test_distributed.py \
 	 -k 'loses_no_committed_update or torchrun_replaces'
 	@VN_NAV_MUTATIONS=50000 $(BIN)/python -m pytest test/test_bag_hostile.py -k mutated
+	@mkdir -p runs && VN_NAV_SOAK=1 VN_NAV_FIGURES=runs/safety.jsonl\
+	 $(BIN)/python -m pytest test/test_soak.py -s
 	@VN_NAV_PICTURE_MUTATIONS=100000 $(BIN)/python -m pytest test/test_picture_files.py -k mutated
 
 lint: $(READY)
