@@ -13,14 +13,16 @@ CONTRAST = 0.2  # either way: exponent, natural logarithm
 GAMMA = 2.2  # of a display
 
 
-def draw_light(seed: int, stream: Stream, env: np.ndarray, episode: np.ndarray) -> np.ndarray:
+def draw_light(seed: int | np.ndarray, stream: Stream, env: np.ndarray,
+               episode: np.ndarray) -> np.ndarray:
     """Tables [N,3,256] uint8 of the grey levels that channels take, for each picture or episode.
 
     Args:
-        as of `counter_random.uniform`; env and episode [N].
+        as of `counter_random.uniform`; seed one number or [N], env and episode [N].
     """
-    drawn = 2 * uniform(seed, stream, np.asarray(env)[:, None], np.asarray(episode)[:, None],
-                        np.arange(4)) - 1
+    env, episode = np.asarray(env)[:, None], np.asarray(episode)[:, None]
+    seed = np.broadcast_to(seed, len(env))[:, None]
+    drawn = 2 * uniform(seed, stream, env, episode, np.arange(4)) - 1
     light = np.log(2) * STOPS * drawn[:, :1] + TINT * np.stack(
         [drawn[:, 1], np.zeros(len(drawn)), drawn[:, 2]], axis=1)
     level = (np.arange(256) / 255)[None, None]

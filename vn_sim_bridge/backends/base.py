@@ -100,7 +100,7 @@ class Simulator(Backend, Protocol):
     def appearance(self, seed: int, stream, env, episode) -> Any:
         """Light and camera of some episodes, or of some goal pictures."""
 
-    def dress(self, env_ids: np.ndarray, seed: int, stream, env, episode) -> None:
+    def dress(self, env_ids: np.ndarray, seed: int | np.ndarray, stream, env, episode) -> None:
         """Draw light and camera of robots [K] anew."""
 
     def set_objects(self, env_id: int, placed: Sequence) -> None:

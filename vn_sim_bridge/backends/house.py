@@ -95,7 +95,8 @@ class HouseBackend:
         return draw_appearance(self.randomisation, self._renderer.rooms, seed, stream, env,
                                episode)
 
-    def dress(self, env_ids: np.ndarray, seed: int, stream: Stream, env, episode) -> None:
+    def dress(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream, env,
+              episode) -> None:
         """Draw light and camera of robots [K] anew, for the counters [K] of their episodes."""
         drawn = self.appearance(seed, stream, env, episode)
         if self._appearance is None:

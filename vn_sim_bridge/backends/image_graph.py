@@ -91,7 +91,8 @@ class ImageGraphBackend:
     def appearance(self, seed: int, stream: Stream, env, episode) -> None:
         """Of views: light and camera are as they were recorded."""
 
-    def dress(self, env_ids: np.ndarray, seed: int, stream: Stream, env, episode) -> None:
+    def dress(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream, env,
+              episode) -> None:
         """Draw the light of episodes."""
         if self._light is not None:
             env, episode = (np.broadcast_to(part, env_ids.shape) for part in (env, episode))
