@@ -1,7 +1,8 @@
 """policy_node for a long time and many times: the figures of docs/safety.md.
 
 Short in `make test-all`; `make soak` sets VN_NAV_SOAK=1 and takes the numbers of trials below
-(VN_NAV_MINUTES: of driving). Each test appends its figures to the file that VN_NAV_FIGURES names, one JSON object a line.
+(VN_NAV_MINUTES: of driving). Each test appends its figures to the file that VN_NAV_FIGURES names,
+one JSON object a line.
 """
 
 import contextlib
