@@ -312,7 +312,7 @@ def test_after_sigint_there_is_a_whole_checkpoint_and_the_rows_so_far(sign, kept
         process = subprocess.Popen(
             [sys.executable, '-m', 'vn_nav.cli', 'teach', str(bag), '--out', str(out),
              '--checkpoint', 'models/anywhere', '--goals', '8', '--cache', str(tmp_path / 'cache'),
-             '--minutes', '10' if sign == 'learning the place' else '0.7'], stdout=said,
+             '--minutes', '10' if sign == 'learning the place' else '1.2'], stdout=said,
             stderr=subprocess.STDOUT)
     try:
         until = time.monotonic() + 240
