@@ -86,6 +86,7 @@ def test_what_is_lost_is_counted(talker, tmp_path):
     with child(RECORDER, tmp_path / 'log', output=tmp_path / 'bag',
                topics=['odom']) as process:
         heard_by(publisher)
+        time.sleep(0.5)  # the other side has met this one as well
 
         def publish(count):
             for _ in range(count):

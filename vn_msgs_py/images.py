@@ -126,7 +126,8 @@ def _raw_array(message: Any, allowed: tuple[str, ...]) -> np.ndarray:
     """The checked pixels: [H,W] or [H,W,C] in native byte order, padding removed."""
     name = message.encoding
     if name not in allowed:
-        raise ImageError(f'the encoding is one of {", ".join(allowed)}', name,
+        some = ', '.join(allowed[:6]) + (', ... (docs/bags.md)' if len(allowed) > 6 else '')
+        raise ImageError(f'the encoding is one of {some}', name,
                          'convert it with image_proc, or set the camera driver')
     encoding = ENCODINGS[name]
     height, width, step = int(message.height), int(message.width), int(message.step)
