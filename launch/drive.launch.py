@@ -60,6 +60,9 @@ def generate_launch_description():
     ])
 
 
+KEPT = ('namespace', 'params_file', 'use_sim_time', 'log_level', 'use_respawn')
+
+
 def _start(context):
     """Start the node; without its parameters it would be another one."""
     path = LaunchConfiguration('params_file').perform(context)
@@ -67,35 +70,42 @@ def _start(context):
         raise RuntimeError(f'params_file is a file that exists; received {path!r}; correct it')
     # The node configures and activates itself, once: what an operator does later with
     # `ros2 lifecycle set` is not followed by anything behind his back.
-    return _policy(ParameterValue(LaunchConfiguration('autostart'), value_type=bool))
+    return _policy(ParameterValue(LaunchConfiguration('autostart'), value_type=bool),
+                   {name: LaunchConfiguration(name).perform(context) for name in KEPT},
+                   context.launch_configurations.get('ros_remaps', []))
 
 
-def _policy(autostart):
-    """Return the node, and what follows its end."""
+def _policy(autostart, kept, remaps):
+    """Return the node, and what follows its end.
+
+    What surrounds it is given as values: when it is started again, the group and the includes
+    around it, with their namespace and remappings, are over.
+    """
+    def on_exit(event, context):
+        return _on_exit(event, context, kept, remaps)
     policy = Node(
         package='vn_nav',
         executable='policy_node',
         name='policy_node',
-        namespace=LaunchConfiguration('namespace'),
+        namespace=kept['namespace'],
+        remappings=list(remaps),
         parameters=[
-            LaunchConfiguration('params_file'),
-            {'use_sim_time': ParameterValue(
-                LaunchConfiguration('use_sim_time'), value_type=bool), 'autostart': autostart},
+            kept['params_file'],
+            {'use_sim_time': kept['use_sim_time'] == 'true', 'autostart': autostart},
         ],
-        arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
+        arguments=['--ros-args', '--log-level', kept['log_level']],
         output='screen',
     )
-    return [RegisterEventHandler(OnProcessExit(target_action=policy, on_exit=_on_exit)), policy]
+    return [RegisterEventHandler(OnProcessExit(target_action=policy, on_exit=on_exit)), policy]
 
 
-def _on_exit(event, context):
+def _on_exit(event, context, kept, remaps):
     """End the launch with the node, or start it again."""
     if context.is_shutdown:
         return []
     if event.returncode in (0, -signal.SIGINT):
         return [Shutdown(reason='policy_node has ended')]
-    if event.returncode != BAD_INPUT and (
-            LaunchConfiguration('use_respawn').perform(context) == 'true'):
+    if event.returncode != BAD_INPUT and kept['use_respawn'] == 'true':
         # Unconfigured: after a crash somebody looks before the robot moves.
-        return [TimerAction(period=RESPAWN_DELAY, actions=_policy(False))]
+        return [TimerAction(period=RESPAWN_DELAY, actions=_policy(False, kept, remaps))]
     raise RuntimeError(f'policy_node died with exit code {event.returncode}; see its output above')

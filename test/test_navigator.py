@@ -327,3 +327,39 @@ def test_continuous_mode_decides_in_motion():
         assert ticket is not None
         rig.navigator.decided(ticket, 0, rig.now)
     assert velocity[0] > 0.05
+
+
+def test_a_stop_that_is_cleared_at_once_still_sends_its_zeros(rig):
+    rig.arm()
+    while not rig.step().any():
+        rig.decide()
+    rig.navigator.stop('~/stop was called', rig.now)
+    rig.navigator.reset()  # before the output thread was asked
+    sent = [rig.step() for _ in range(int(1.5 / DT))]
+    zeros = [velocity for velocity in sent if velocity is not None]
+    assert len(zeros) >= 0.9 / DT and not np.any(zeros)
+    rig.navigator.stop('again', rig.now)
+    while rig.step() is not None:
+        pass
+    rig.navigator.reset()
+    assert rig.step() is None, 'what was said is not said again'
+
+
+def test_a_picture_taken_in_motion_is_no_picture_at_rest(rig):
+    rig.arm()
+    while not rig.step().any():
+        rig.decide()
+    rig.navigator.odometry_jumped('odometry jumped by 2 m')
+    assert not rig.step().any()
+    stopped = rig.now
+    while rig.frame_later() is None:
+        assert rig.now < stopped + 1
+    assert rig.now > stopped + rig.navigator.limits.settle_time
+
+
+def test_a_goal_that_is_refused_in_motion_stands_still(rig):
+    rig.arm()
+    while not rig.step().any():
+        rig.decide()
+    rig.navigator.refuse_goal('the camera is too narrow')
+    assert not rig.step().any() and rig.navigator.state is State.HOLD

@@ -264,6 +264,8 @@ def test_a_thread_that_dies_takes_the_node_out_of_action(checkpoint, tmp_path):
         robot.wait_for_zero()
         refusal = robot.refusal()
         assert 'not active' in refusal and 'the accelerator is gone' in refusal
+        robot.says('inactive: the inference thread failed')
+        assert robot.statuses[-1][1] == b'\x02'
         assert process.poll() is None and 'Traceback' not in (tmp_path / 'log').read_text()
         assert robot.transition(Transition.TRANSITION_ACTIVATE)
         robot.enable()
@@ -292,9 +294,11 @@ def test_messages_that_no_camera_sends_end_no_thread(checkpoint, tmp_path):
 def test_odometry_that_is_set_anew_ends_the_action(checkpoint, tmp_path):
     with robot_and_node(checkpoint, tmp_path, robot={'odometry': RELIABLE}) as (robot, _):
         robot.drive()
-        robot.pose[:2] += 20.0
-        robot.wait_for_zero(1.0)
-        wait_until(robot.moving, robot.spin)
+        for change in ((20.0, 0.0, 0.0), (-0.45, 0.0, 0.0), (0.0, 0.0, -1.0)):
+            wait_until(robot.moving, robot.spin)
+            robot.pose += change
+            robot.wait_for_zero(1.0)
+            robot.says('jumped')
 
 
 def test_dropped_frames_are_counted_by_kind(checkpoint, tmp_path):

@@ -48,8 +48,8 @@ def test_frames_that_are_not_later_are_dropped():
     assert gate.dropped == {'reordered stamp': 3}
 
 
-def looks(*pairs):
-    watch = ClockWatch()
+def looks(*pairs, simulated=True):
+    watch = ClockWatch(simulated=simulated)
     return [watch.look(clock, steady) for clock, steady in pairs]
 
 
@@ -63,6 +63,7 @@ def test_a_clock_that_goes_its_way():
     assert not any(looks((10.0, 1.0), (20.0, 11.0)))  # the process was suspended
     assert not any(looks((10.0, 1.0), (14.0, 1.5)))  # a simulator eight times as fast
     assert not any(looks((10.0, 1.0), (9.95, 1.05)))  # NTP
+    assert any(looks((10.0, 1.0), (11.1, 1.05), simulated=False)), 'no clock of this world'
 
 
 def test_a_goal_is_a_stamp_and_a_picture():
@@ -78,8 +79,8 @@ def test_a_goal_at_a_rate_is_one_goal():
     new = [watch.is_new(stamp, 'kitchen', stamp / 10) for stamp in range(50)]
     assert new == [True, True] + [False] * 48
     assert '10.0 times a second' in watch.warning(4.9) and 'once' in watch.warning(4.9)
-    assert not watch.warning(8.0)
-    assert watch.is_new(100, 'kitchen', 10.0), 'after a pause it is meant anew'
+    assert not watch.warning(12.0)
+    assert watch.is_new(100, 'kitchen', 20.0), 'after a pause it is meant anew'
     watch = GoalWatch(trust_stamps=True)
     assert all(watch.is_new(stamp, 'kitchen', stamp / 10) for stamp in range(50))
     assert not watch.warning(4.9)
@@ -89,4 +90,11 @@ def test_goals_that_change_all_the_time_are_named():
     watch = GoalWatch()
     assert all(watch.is_new(stamp, stamp, stamp / 10) for stamp in range(50))
     assert 'each picture is a new goal' in watch.warning(4.9)
-    assert not watch.warning(8.0)
+    assert not watch.warning(12.0)
+
+
+@pytest.mark.parametrize('period', [0.1, 1.0, 2.5, 4.0])
+def test_any_rate_is_noticed(period):
+    watch = GoalWatch()
+    new = [watch.is_new(stamp, 'kitchen', stamp * period) for stamp in range(20)]
+    assert sum(new) == 2 and 'publish it once' in watch.warning(19 * period)

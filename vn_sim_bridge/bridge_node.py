@@ -105,11 +105,12 @@ class SimBridgeNode(Node):
 
     def _other_clocks(self) -> list[str]:
         """Who else publishes on the clock's topic."""
-        me = (self.get_name(), self.get_namespace())
-        return sorted({f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                       for info in self.get_publishers_info_by_topic(
-                           self.resolve_topic_name(CLOCK))
-                       if (info.node_name, info.node_namespace) != me})
+        names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                 for info in self.get_publishers_info_by_topic(self.resolve_topic_name(CLOCK))]
+        # Two bridges may have one name: a name is this node's once, and only when it publishes.
+        if self._clock is not None and (me := self.get_fully_qualified_name()) in names:
+            names.remove(me)
+        return sorted(set(names))
 
     def _publish_clock(self, stamp: Time) -> None:
         """Say the time, as soon as it is clear that nobody else does.

@@ -18,7 +18,9 @@ from vn_nav.policy.clock_watch import ClockWatch
 from vn_nav.policy.navigator import Navigator
 
 CROSSING = 0.03  # s of wall time, see _lock_step
-JUMP_M = 0.5  # odometry that moves by this, and more than the robot could have, was set anew
+# Odometry that moves by this, and by more than the robot could have, was set anew.
+JUMP_M, JUMP_RAD = 0.1, 0.3
+DRIVABLE = 3.0  # times the robot's limits: they are conservative, and messages come in bursts
 REORDERED_S = 1.0  # odometry from longer ago is from another time
 
 
@@ -55,7 +57,8 @@ class CommandOutput:
         self._received = -math.inf
         self._count = 0
         self._robot_moves = False  # by the last command sent
-        self._clock_watch = ClockWatch()
+        self._clock_watch = ClockWatch(
+            simulated=bool(node.get_parameter('use_sim_time').value))
 
     @property
     def silence(self) -> float:
@@ -83,21 +86,28 @@ class CommandOutput:
                 self._navigator.time_jumped(f'odometry stamps went back by {back:.4g} s')
             elif 0.0 < back < REORDERED_S:
                 return
-            elif not self._in_lock_step and (jump := self._jump(values, now)) > 0.0:
-                self._navigator.odometry_jumped(f'odometry jumped by {jump:.4g} m')
+            elif not self._in_lock_step and (jump := self._jump(values, now, back)):
+                self._navigator.odometry_jumped(jump)
             self.odometry, self._stamp = values[:3], values[6]
             self._rests = not values[3:6].any()
             self._received = now
             self._count += 1
             self._wake.notify_all()
 
-    def _jump(self, values: np.ndarray, now: float) -> float:
-        """Metres of a step in the pose that no driving explains; 0: there is none."""
+    def _jump(self, values: np.ndarray, now: float, back: float) -> str:
+        """A step in the pose that no driving explains, in words; empty: there is none."""
         if self.odometry is None:
-            return 0.0
+            return ''
+        if back > 0.0:
+            return f'odometry stamps went back by {back:.4g} s'
+        robot, passed = self._navigator.robot, now - self._received
         step = math.hypot(*(values[:2] - self.odometry[:2]))
-        drivable = 3.0 * self._navigator.robot.max_linear * (now - self._received)
-        return step if step > JUMP_M + drivable else 0.0
+        turn = abs((values[2] - self.odometry[2] + math.pi) % (2 * math.pi) - math.pi)
+        if step > JUMP_M + DRIVABLE * robot.max_linear * passed:
+            return f'odometry jumped by {step:.4g} m'
+        if turn > JUMP_RAD + DRIVABLE * robot.max_angular * passed:
+            return f'odometry jumped by {math.degrees(turn):.4g} deg'
+        return ''
 
     def run(self, is_running: Callable[[], bool]) -> None:
         """Publish commands until `is_running` says that the node does not any more."""
@@ -171,9 +181,11 @@ class CommandOutput:
                     self._wait_for_odometry(self._count, or_decision=False, timeout=CROSSING)
                 if not self._is_running():
                     return
+                if moving and self._count == answered and not self.odometry_lost:
+                    continue  # nobody asked: a velocity unasked would move it a tick further
                 answered = self._count
                 velocity = self._navigator.step(time.monotonic(), self._period, self.odometry,
-                                                self._stamp)
+                                                self._stamp, odometry_lost=self.odometry_lost)
                 moved = velocity is not None and bool(velocity.any())
                 moving, first = moved, moved and not moving
             if velocity is not None:

@@ -194,10 +194,10 @@ class DecisionWorker:
                 self._navigator.declared(ticket, self._runtime.arrival, now)
                 self.tell_arrival()
             else:
-                self._navigator.decided(ticket, action, now)
                 # Still holding the lock: whoever hears of it finds it decided, and no command for
                 # it is out yet.
-                self._action.publish(Int8(data=action))
+                if self._navigator.decided(ticket, action, now):
+                    self._action.publish(Int8(data=action))
             self._wake.notify_all()
 
     def _prepare(self, message) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 
@@ -33,30 +34,35 @@ class Diagnosis:
         self._published = 0.0
 
     def publish(self, state: State, reason: str, values: dict,
-                warnings: Sequence[str] = ()) -> None:
+                warnings: Sequence[str] = (), *, fault: str = '') -> None:
         """Say where the node stands; the same again within a second is not said.
 
         Args:
             state, reason: of the navigator.
             values: by key.
             warnings: what is wrong though it may drive; the first is part of the message.
+            fault: why the node is out of action, if it is.
         """
         warnings = [shorten(warning) for warning in warnings[:MOST_WARNINGS]]
-        changed = self._last != (state, reason, *warnings)
+        # Rates in a warning change all the time: it is the same warning.
+        told = tuple(re.sub(r'[0-9.]+', '#', warning) for warning in warnings)
+        changed = self._last != (state, reason, fault, *told)
         if not changed and time.monotonic() - self._published < 0.95:
             return
         if changed and state is State.STOPPED:
             self.node.get_logger().error(f'stopped: {reason}; ~/reset, then ~/enable to go on')
-        for warning in warnings:
-            if self._last is None or warning not in self._last:
+        for warning, short in zip(warnings, told, strict=True):
+            if self._last is None or short not in self._last:
                 self.node.get_logger().warning(warning, throttle_duration_sec=5.0)
-        self._last, self._published = (state, reason, *warnings), time.monotonic()
+        self._last, self._published = (state, reason, fault, *told), time.monotonic()
         level, words = LEVELS.get(state, DiagnosticStatus.OK), state.value
         if reason:
             words += f' ({reason})' if state is State.ARRIVED else f': {reason}'
         if warnings:
             level = max(level, DiagnosticStatus.WARN)
             words += f'; {warnings[0]}'
+        if fault:
+            level, words = DiagnosticStatus.ERROR, fault
         if mismatch := self._mismatched_listeners():
             level, words = DiagnosticStatus.ERROR, mismatch
         values = {'state': state.value, 'reason': reason,

@@ -114,7 +114,7 @@ class PolicyInputs:
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         side, focal = min(message.width, message.height), message.k[0]
-        if not (side > 0 and math.isfinite(focal) and focal > 0):
+        if side <= 0 or focal == 0:
             return  # an uncalibrated camera says zero
         fov = 2 * math.atan(side / 2 / focal)
         if not CAMERA_FOV[0] <= fov <= CAMERA_FOV[1]:

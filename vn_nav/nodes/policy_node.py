@@ -55,14 +55,15 @@ class PolicyNode(LifecycleNode):
         self._interfaces: list = []
         self.broken = ''  # why the node went inactive by itself
         self.failure: UserError | None = None
+        self.starts = False  # `drive` brings it up, and says itself why that fails
 
     def _on_parameters(self, parameters) -> SetParametersResult:
-        """Operation is fixed while active: a limit must not move under a moving robot."""
+        """Operation is read when the node is configured; what comes later would do nothing."""
         for parameter in parameters:
-            if parameter.name in policy_parameters.PARAMETERS and self.is_running:
+            if parameter.name in policy_parameters.PARAMETERS and self._interfaces:
                 return SetParametersResult(successful=False, reason=(
-                    f'{parameter.name} is fixed while the node is active; received '
-                    f'{parameter.value!r}; deactivate first'))
+                    f'{parameter.name} is fixed while the node is configured; received '
+                    f'{shorten(repr(parameter.value))}; deactivate and clean up first'))
             try:
                 if parameter.name in policy_parameters.PARAMETERS:
                     policy_parameters.check(parameter.name, parameter.value)
@@ -89,7 +90,7 @@ class PolicyNode(LifecycleNode):
     def _fail(self, error: UserError) -> None:
         """Say why a transition failed: once. With autostart `main` says it and exits."""
         self.failure = error
-        if not self.get_parameter('autostart').value:
+        if not self.starts:
             self.get_logger().error(str(error))
 
     def _configure(self) -> None:
@@ -154,6 +155,7 @@ class PolicyNode(LifecycleNode):
         self.broken = ''
         self._threads = WorkThreads({'inference': self._worker.run, 'output': self._output.run},
                                     self._on_failed_thread)
+        self._threads.start()
         self._say_what_it_waits_for()
         return super().on_activate(state)
 
@@ -232,8 +234,10 @@ class PolicyNode(LifecycleNode):
             self.get_logger().error(f'a decision did not end within {WORKER_PATIENCE:g} s')
         return ended
 
-    def _on_failed_thread(self, name: str, error: Exception) -> None:
+    def _on_failed_thread(self, threads: WorkThreads, name: str, error: Exception) -> None:
         """A failing thread stops the robot; `tend` then takes the node out of action."""
+        if threads is not self._threads or not threads.is_running():
+            return  # of an activation that has ended, with its zero delivered
         with self._wake:
             self.broken = shorten(f'the {name} thread failed: {error!r}')
             self.navigator.stop(self.broken, time.monotonic())
@@ -298,6 +302,7 @@ class PolicyNode(LifecycleNode):
         with self._wake:
             self.navigator.reset()
             self._worker.tell_arrival()
+            self._wake.notify_all()
         response.success, response.message = True, 'ready: ~/enable to go on'
         return response
 
@@ -325,7 +330,8 @@ class PolicyNode(LifecycleNode):
         if time.monotonic() - self._warned_at > WARNINGS_PERIOD:
             self._warned_at = time.monotonic()
             self._warnings = self._inputs.warnings()
-            if self.get_parameter('use_sim_time').value and self.count_publishers('/clock') > 1:
+            if self.get_parameter('use_sim_time').value and (
+                    self.count_publishers(self.resolve_topic_name('/clock')) > 1):
                 self._warnings.append('/clock has several publishers: time will jump; keep one')
         with self._wake:
             state, reason = self.navigator.state, self.navigator.reason
@@ -335,7 +341,8 @@ class PolicyNode(LifecycleNode):
                       **{f'dropped: {kind}': n for kind, n in gate.dropped.items()},
                       **({'last_dropped': gate.last} if gate.last else {}),
                       **({'broken': self.broken} if self.broken else {})}
-        self._diagnosis.publish(state, reason, values, self._warnings)
+        self._diagnosis.publish(state, reason, values, self._warnings,
+                                fault=f'inactive: {self.broken}' if self.broken else '')
 
 
 def drive(node: PolicyNode, ended: Ended) -> None:
@@ -368,7 +375,10 @@ def drive(node: PolicyNode, ended: Ended) -> None:
 
 
 def _transit(node: PolicyNode, transition) -> None:
-    if transition() != TransitionCallbackReturn.SUCCESS:
+    node.starts = True
+    done = transition()
+    node.starts = False
+    if done != TransitionCallbackReturn.SUCCESS:
         raise node.failure or UserError(f'{transition.__name__} succeeds', 'an error, see above',
                                         'report it')
 

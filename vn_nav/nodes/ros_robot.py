@@ -364,7 +364,7 @@ class RosRobot(Node):
         self._until(lambda: not self._missing(), lambda: f'waits for {", ".join(self._missing())}')
         if self.camera_fov is not None:
             crop_fraction(self.camera_fov, self.robot.camera_fov)
-        self._threads = WorkThreads({'output': self.output.run}, self._on_failed_thread)
+        self._threads = WorkThreads({'output': self.output.run}, self._on_failed_thread).start()
 
     def _missing(self) -> list[str]:
         found = (('image_raw', self._frame is not None),
@@ -574,7 +574,7 @@ class RosRobot(Node):
     def _running(self) -> bool:
         return self._threads is not None and self._threads.is_running()
 
-    def _on_failed_thread(self, name: str, error: Exception) -> None:
+    def _on_failed_thread(self, _threads: WorkThreads, name: str, error: Exception) -> None:
         self.fail(f'the {name} thread failed: {error!r}')
         self.output.deliver_zero()
 

@@ -9,20 +9,25 @@ Loop = Callable[[Callable[[], bool]], None]  # returns soon after what it is giv
 
 
 class WorkThreads:
-    """Threads that are started once and end together. A failure of one is reported, never lost.
+    """Threads that are started and end together. A failure of one is reported, never lost.
 
     Args:
         loops: by name.
-        on_failure: called on the failing thread with its name and the exception.
+        on_failure: called on the failing thread with this object, its name and the exception.
     """
 
-    def __init__(self, loops: Mapping[str, Loop], on_failure: Callable[[str, Exception], None]):
+    def __init__(self, loops: Mapping[str, Loop],
+                 on_failure: Callable[[WorkThreads, str, Exception], None]):
         self._on_failure = on_failure
         self._ended = False
         self._threads = {name: threading.Thread(target=self._guard, args=(name, loop), name=name,
                                                 daemon=True) for name, loop in loops.items()}
+
+    def start(self) -> WorkThreads:
+        """Start them, once."""
         for thread in self._threads.values():
             thread.start()
+        return self
 
     def is_running(self) -> bool:
         """They have not been told to end."""
@@ -41,4 +46,4 @@ class WorkThreads:
         try:
             loop(self.is_running)
         except Exception as error:  # whatever it was
-            self._on_failure(name, error)
+            self._on_failure(self, name, error)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import collections
 
-AGAIN_S = 2.0  # the same picture within this time of the one before is said again
+AGAIN_S = 5.0  # the same picture within this time of the one before is said again
 AGAIN_TIMES = 2  # and from the second repetition on it is taken as one goal
-RATE_S = 5.0  # of which a rate is counted
+RATE_S = 20.0  # of which a rate is counted
 
 
 class GoalWatch:
@@ -52,7 +52,7 @@ class GoalWatch:
         if not recent[-1][1]:
             return (f'goal_image is published {rate:.1f} times a second, each time with a new '
                     'stamp: one picture is one goal; publish it once')
-        if rate > 0.5 and sum(new for _, new in recent) >= 4:
+        if rate > 0.2 and sum(new for _, new in recent) >= 4:
             return (f'goal_image changes {rate:.1f} times a second, and each picture is a new '
                     'goal: the robot waits; publish a goal once')
         return ''

@@ -72,7 +72,7 @@ class Navigator:
 
     def __init__(self, robot: RobotSpec, limits: Limits, *, continuous: bool = False,
                  exact: bool = False):
-        self.robot, self.limits, self.continuous = robot, limits, continuous
+        self.robot, self.limits, self.continuous, self.exact = robot, limits, continuous, exact
         self.executor = (ActionExecutor(robot, tolerance=1e-6, creep=0.0) if exact
                          else ActionExecutor(robot, tolerance=0.004, creep=0.02))
         self.state, self.reason = State.IDLE, 'not enabled'
@@ -86,7 +86,8 @@ class Navigator:
         self.epoch = 0  # grows when time was set: what the policy remembers is of another time
         self.goal_refusal = ''  # why the newest goal picture was unusable
         self._target = np.zeros(4)
-        self._stopped_at = 0.0
+        self._stopped_from: float | None = None  # steady time of a stop's first zero
+        self._settles = False  # a motion was cut off: a picture at rest is still to come
         self._idle_from: float | None = -np.inf  # steady time of leaving motion; None: just now
         self._healthy_since: float | None = None
         self._last_frame: float | None = None  # steady time at which the newest good frame came
@@ -151,13 +152,14 @@ class Navigator:
     def accept_goal(self, stamp: float) -> None:
         """The policy knows the goal. Frames up to `stamp` belong to the episode before."""
         self.goal_ready, self.decisions = True, 0
-        self._look_after = stamp
+        self._look_after = max(self._look_after, stamp)
 
     def refuse_goal(self, why: str) -> None:
         """The goal picture was unusable: as if there were none."""
         self.goal_ready, self.goal_refusal = False, shorten(why)
-        if self.state is State.HOLD:
-            self.reason = f'goal refused: {self.goal_refusal}'
+        self._abandon()
+        if self.state in (State.RUNNING, State.HOLD, State.ARRIVED):
+            self.state, self.reason = State.HOLD, f'goal refused: {self.goal_refusal}'
 
     # Commands of people.
 
@@ -194,7 +196,7 @@ class Navigator:
     def stop(self, reason: str, now: float) -> None:
         """Zero at once, latched."""
         if self.state is not State.STOPPED:
-            self.state, self.reason, self._stopped_at = State.STOPPED, shorten(reason), now
+            self.state, self.reason, self._stopped_from = State.STOPPED, shorten(reason), None
         self.arrival = None
         self._abandon()
 
@@ -205,7 +207,8 @@ class Navigator:
 
     def _idle(self, reason: str) -> None:
         self._abandon()
-        if self.state not in (State.IDLE, State.STOPPED):
+        if self.state in ENABLED or (
+                self.state is State.STOPPED and self._stopped_from is None):
             self._idle_from = None  # a command may be in force: the next step takes it back
         self.state, self.reason, self.arrival = State.IDLE, reason, None
 
@@ -213,6 +216,7 @@ class Navigator:
         """Forget the action and the decision under way; velocity zero."""
         self.cut_off += self.phase is Phase.MOVE or self._pending_action is not None
         self.phase, self.executor.action = Phase.LOOK, None
+        self._settles |= bool(self.velocity.any())
         self._ticket += 1
         self._inferring_since = self._pending_action = None
         self.velocity, self._target = np.zeros(4), np.zeros(4)
@@ -233,10 +237,12 @@ class Navigator:
         self._inferring_since = now
         return self._ticket
 
-    def decided(self, ticket: int, action: int, now: float) -> None:
-        """The decision behind a ticket; discarded when it is late or no longer wanted."""
-        if self._in_time(ticket, now):
-            self._pending_action = action
+    def decided(self, ticket: int, action: int, now: float) -> bool:
+        """The decision behind a ticket; False: discarded, as late or no longer wanted."""
+        if not self._in_time(ticket, now):
+            return False
+        self._pending_action = action
+        return True
 
     def declared(self, ticket: int, probability: float, now: float) -> None:
         """The decision behind a ticket is that the robot has arrived: zero velocity at once.
@@ -307,10 +313,16 @@ class Navigator:
             stamp: present time in the frames' clock [s].
             odometry_lost: there was odometry, and it fell silent: nobody drives blind.
         """
+        if self._settles:  # what moved is told to stand still now
+            self._settles = False
+            if not (self.continuous or self.exact):
+                self._look_after = max(self._look_after, stamp + self.limits.settle_time)
         if odometry_lost and self.state is State.RUNNING and self.velocity.any():
             self.stop('odometry fell silent in motion', now)
         if self.state is State.STOPPED:
-            return np.zeros(4) if now - self._stopped_at < STOP_SECONDS else None
+            if self._stopped_from is None:
+                self._stopped_from = now
+            return np.zeros(4) if now - self._stopped_from < STOP_SECONDS else None
         if self.state is State.IDLE:
             if self._idle_from is None:
                 self._idle_from = now
