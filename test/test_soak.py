@@ -252,7 +252,9 @@ def test_an_hour_of_driving(make_robot, checkpoint, tmp_path):
             if time.monotonic() - goal > 60:
                 goal = time.monotonic()
                 robot.show_goal(len(readings))
-        assert process.poll() is None and robot.statuses[-1][3]['state'] != 'stopped'
+        assert process.poll() is None and robot.statuses[-1][3]['state'] != 'stopped', (
+            robot.statuses[-1], [line for line in (tmp_path / 'log').read_text().splitlines()
+                                 if 'stopped' in line])
     grown = (max(rss for _, rss in readings[-3:]) - first) / 2**20
     figure('memory grown by driving', [grown], 'MiB', minutes=MINUTES,
            decisions_last_goal=int(robot.statuses[-1][3]['decisions']))
