@@ -257,5 +257,6 @@ def test_an_hour_of_driving(make_robot, checkpoint, tmp_path):
                                  if 'stopped' in line])
     grown = (max(rss for _, rss in readings[-3:]) - first) / 2**20
     figure('memory grown by driving', [grown], 'MiB', minutes=MINUTES,
+           by_reading=[round((rss - first) / 2**20, 1) for _, rss in readings[::12]],
            decisions_last_goal=int(robot.statuses[-1][3]['decisions']))
     assert grown < (5 if LONG else 50)
