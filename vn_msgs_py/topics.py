@@ -73,9 +73,10 @@ TOPICS = (
     _history('reward', 'std_msgs/msg/Float32', 'bridge',
              "at a decision's end: 1 on arrival, else 0"),
     _history('episode_end', 'std_msgs/msg/UInt8', 'bridge', '1 terminated, 2 truncated'),
-    # Deep, so that a recorder keeps up with lock-step.
+    # Five seconds of history: a recorder that is matched late has the beginning, too.
     Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', 'bridge',
-          'true pose in the map, for evaluation; the policy never reads it', depth=100),
+          'true pose in the map, for evaluation; the policy never reads it', RELIABLE, LATCHED,
+          100),
     _sensor('scan', 'sensor_msgs/msg/LaserScan', 'bridge',
             'exact, all around, at what the robot would bump into'),
     Topic('/tf', 'tf2_msgs/msg/TFMessage', 'bridge',

@@ -46,6 +46,7 @@ LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base 
 STATEMENT_PATIENCE = 2.0  # s of wall time, see _on_arrived
 # s after which a node has heard of the others: Fast DDS announces itself every 3 s.
 DISCOVERY = 6.0
+LINGER = 3.5  # s after the last episode
 REPORT = 1.0  # s of wall time between two messages on /diagnostics
 BEHIND = 2  # ticks lost between two of them that are worth a warning
 AT_ONCE = 10  # callbacks that are served when a tick is overdue
@@ -375,7 +376,8 @@ def run(node: SimBridgeNode, ended: Ended) -> None:
     next_tick = time.monotonic()
     while not ended.is_set():
         if node.done and node.exit_when_done:
-            linger = time.monotonic() + 0.5  # the last messages are still on their way
+            # What was said is latched: a recorder that is still being matched gets it.
+            linger = time.monotonic() + LINGER
             while time.monotonic() < linger and not ended.is_set():
                 executor.spin_once(timeout_sec=0.05)
             return
