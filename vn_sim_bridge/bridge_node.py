@@ -46,7 +46,7 @@ LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base 
 STATEMENT_PATIENCE = 2.0  # s of wall time, see _on_arrived
 # s after which a node has heard of the others: Fast DDS announces itself every 3 s.
 DISCOVERY = 6.0
-LINGER = 1.8  # s after the last episode; the policy would stop after 2 without a picture
+LINGER = 1.0  # s after the last episode; the policy would stop after 2 without a picture
 REPORT = 1.0  # s of wall time between two messages on /diagnostics
 BEHIND = 2  # ticks lost between two of them that are worth a warning
 AT_ONCE = 10  # callbacks that are served when a tick is overdue
