@@ -34,3 +34,15 @@ def check_size(height: int, width: int, most: int = MAX_PIXELS) -> None:
     if height * width > most or max(height, width) > MAX_SIDE_PX:
         raise TooLargeError(f'a picture has at most {most} pixels, {MAX_SIDE_PX} on a side',
                             (height, width), 'lower its resolution')
+
+
+def truncated(rule: str, received: object) -> ImageError:
+    """The error of a file that ends too early."""
+    return ImageError(rule, received, 'the data is truncated: check the network and the camera '
+                      'driver, or copy the file again')
+
+
+def damaged(rule: str, received: object) -> ImageError:
+    """The error of a file that is not what its format says."""
+    return ImageError(rule, received,
+                      'the data is damaged: check the camera driver, or copy the file again')

@@ -12,7 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from vn_msgs_py.exif import read_orientation
-from vn_msgs_py.image_error import MAX_PIXELS, ImageError, TooLargeError, check_size
+from vn_msgs_py.image_error import (
+    MAX_PIXELS,
+    ImageError,
+    TooLargeError,
+    check_size,
+    damaged,
+    truncated,
+)
 
 MAX_SEGMENTS = 5_000  # an ICC profile takes up to 255, a large XMP block some hundred
 MAX_SCANS = 64  # encoders write 1 to 20
@@ -43,7 +50,7 @@ class _Frame:
 
     def __init__(self, marker: int, body: bytes, most: int):
         if len(body) < 6 or len(body) != 6 + 3 * body[5]:
-            raise _damaged('a JPEG frame header lists its components', f'{len(body)} bytes')
+            raise damaged('a JPEG frame header lists its components', f'{len(body)} bytes')
         precision, self.height, self.width, count = struct.unpack_from('>BHHB', body)
         check_size(self.height, self.width, most)
         if precision != 8 or count not in (1, 3, 4):
@@ -54,7 +61,7 @@ class _Frame:
         self.sampling = dict(zip(body[6::3], zip(across, down, strict=True), strict=True))
         self._most = max(across), max(down)
         if len(self.sampling) != count or max(self._most) > 4 or not (min(across) and min(down)):
-            raise _damaged('JPEG components differ and are sampled 1 to 4 times', body[6:].hex())
+            raise damaged('JPEG components differ and are sampled 1 to 4 times', body[6:].hex())
         self._seen: set[int] = set()  # components of which a (DC) scan has come
         self._scans = 0
 
@@ -73,11 +80,11 @@ class _Frame:
         """Check a scan header; the bits that the scan has at least."""
         count = body[0] if body else 0
         if not 1 <= count <= 4 or len(body) != 4 + 2 * count:
-            raise _damaged('a JPEG scan header lists its components', body[:16].hex())
+            raise damaged('a JPEG scan header lists its components', body[:16].hex())
         components = tuple(body[1:1 + 2 * count:2])
         new = set(components)
         if len(new) != count or not new <= self.sampling.keys():
-            raise _damaged("a JPEG scan is of the frame's components", components)
+            raise damaged("a JPEG scan is of the frame's components", components)
         self._scans += 1
         if self._scans > MAX_SCANS or self._scans * self.height * self.width > MAX_SCANNED_PX:
             raise ImageError(f'a JPEG has at most {MAX_SCANS} scans, fewer if it is large',
@@ -91,7 +98,7 @@ class _Frame:
                     'save it as a baseline JPEG, or lower its resolution')
         if not self.progressive:
             if new & self._seen:
-                raise _damaged('a baseline JPEG has each component in one scan', components)
+                raise damaged('a baseline JPEG has each component in one scan', components)
             self._seen |= new
             return 2 * self.units(components)
         if body[-3] == 0:
@@ -121,7 +128,7 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
         if at + 4 > len(data) and data[at:at + 2] != b'\xff\xd9':
             raise _truncated(f'{len(data)} bytes without an end marker')
         if data[at] != 0xFF:
-            raise _damaged('a JPEG segment begins with a marker', f'byte {at}: {data[at]:#04x}')
+            raise damaged('a JPEG segment begins with a marker', f'byte {at}: {data[at]:#04x}')
         marker = data[at + 1]
         if marker == 0xFF:  # fill byte
             at += 1
@@ -134,8 +141,8 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
         segments += 1
         length = struct.unpack_from('>H', data, at + 2)[0]
         if marker in (0, SOI) or length < 2 or segments > MAX_SEGMENTS:
-            raise _damaged(f'a JPEG has up to {MAX_SEGMENTS} segments with a length each',
-                           f'segment {segments} at byte {at}: {marker:#04x}, {length}')
+            raise damaged(f'a JPEG has up to {MAX_SEGMENTS} segments with a length each',
+                          f'segment {segments} at byte {at}: {marker:#04x}, {length}')
         if at + 2 + length > len(data):
             raise _truncated(f'a segment of {length} bytes at byte {at} of {len(data)}')
         if marker in TABLES:  # the decoder's business
@@ -145,14 +152,14 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
         at += 2 + length
         if marker in (BASELINE, EXTENDED, PROGRESSIVE):
             if frame is not None:
-                raise _damaged('a JPEG has one frame header', 'two')
+                raise damaged('a JPEG has one frame header', 'two')
             frame = _Frame(marker, body, most)
         elif marker in OTHER_FRAMES:
             raise ImageError('a JPEG is baseline or progressive, with Huffman codes',
                              f'frame {marker:#04x}', 'save it as a baseline JPEG')
         elif marker == SOS:
             if frame is None:
-                raise _damaged('a JPEG has a frame header', 'a scan without one')
+                raise damaged('a JPEG has a frame header', 'a scan without one')
             bits, begin = frame.begin_scan(body), at
             at = _scan_end(view, at)
             if 8 * (at - begin) < bits:
@@ -161,7 +168,7 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
         elif marker == APP1 and orientation == 1 and body[:6] == EXIF:
             orientation = read_orientation(body[6:])
     if frame is None:
-        raise _damaged('a JPEG has a frame header', f'{len(data)} bytes without one')
+        raise damaged('a JPEG has a frame header', f'{len(data)} bytes without one')
     frame.finish()
     return JpegFile(frame.height, frame.width, len(frame.sampling), orientation, at + 2)
 
@@ -185,10 +192,4 @@ def _scan_end(view: np.ndarray, at: int) -> int:
 
 
 def _truncated(received: object) -> ImageError:
-    return ImageError('a JPEG is complete to its end marker', received, 'the data is truncated: '
-                      'check the network and the camera driver, or copy the file again')
-
-
-def _damaged(rule: str, received: object) -> ImageError:
-    return ImageError(rule, received,
-                      'the data is damaged: check the camera driver, or copy the file again')
+    return truncated('a JPEG is complete to its end marker', received)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from vn_msgs_py.exif import read_orientation
-from vn_msgs_py.image_error import ImageError, TooLargeError, check_size
+from vn_msgs_py.image_error import ImageError, TooLargeError, check_size, damaged, truncated
 
 SIGNATURE = b'\x89PNG\r\n\x1a\n'
 MAX_CHUNKS = 20_000  # 16 million pixels in IDAT chunks of 8 kB are about 12,000
@@ -51,7 +51,7 @@ def examine_png(data: bytes) -> PngFile:
         ImageError: it is truncated, contradicts itself or asks for more than is given.
     """
     if data[8:16] != b'\0\0\0\x0dIHDR':
-        raise _damaged('a PNG begins with its header', data[8:16])
+        raise damaged('a PNG begins with its header', data[8:16])
     if len(data) < 33:
         raise _truncated(f'{len(data)} bytes without an end chunk')
     shape = _read_header(data[16:29])
@@ -68,13 +68,13 @@ def examine_png(data: bytes) -> PngFile:
             raise _truncated(f'a chunk of {length} bytes at byte {at} of {len(data)}')
         if kind == b'IDAT':
             if pixels and pixels[-1][1] + 12 != begin:
-                raise _damaged('the IDAT chunks of a PNG lie together', f'one at byte {at}')
+                raise damaged('the IDAT chunks of a PNG lie together', f'one at byte {at}')
             pixels.append((begin, end))
         elif kind in (b'IHDR', b'PLTE'):
             if zlib.crc32(data[at + 4:end]) != struct.unpack_from('>I', data, end)[0]:
-                raise _damaged('a PNG chunk fits its checksum', f'{kind!r} at byte {at}')
+                raise damaged('a PNG chunk fits its checksum', f'{kind!r} at byte {at}')
             if pixels or len(header) != (1 if kind == b'IHDR' else 2) or length > 768:
-                raise _damaged('a PNG has IHDR, then PLTE, before its pixels', f'byte {at}')
+                raise damaged('a PNG has IHDR, then PLTE, before its pixels', f'byte {at}')
             header.append(data[at:end + 4])
         elif kind == b'IEND':
             if data[at:at + 12] != END:
@@ -83,7 +83,7 @@ def examine_png(data: bytes) -> PngFile:
         elif kind == b'eXIf':
             orientation = read_orientation(data[begin:end])
         elif not (kind.isalpha() and kind[:1].islower()):
-            raise _damaged('every critical chunk of a PNG is known', f'{kind!r} at byte {at}')
+            raise damaged('every critical chunk of a PNG is known', f'{kind!r} at byte {at}')
         at = end + 4
     png = PngFile(*shape, orientation, b''.join(header), pixels)
     _check_amount(png)
@@ -96,7 +96,7 @@ def _read_header(fields: bytes) -> tuple[int, int, int, int, bool]:
         '>IIBBBBB', fields)
     check_size(height, width)
     if depth not in DEPTHS.get(colour, ()) or compression or filtering or interlace > 1:
-        raise _damaged('a PNG header is of a kind that there is',
+        raise damaged('a PNG header is of a kind that there is',
                        (depth, colour, compression, filtering, interlace))
     return height, width, depth, colour, bool(interlace)
 
@@ -141,7 +141,7 @@ def decode_png(data: bytes, png: PngFile) -> np.ndarray | None:
         lines = np.frombuffer(rows, np.uint8).reshape(png.height, line)
         if (lines[:, 0] == SUB).all():  # so OpenCV writes them; faster than by libpng
             if zlib.adler32(rows) != struct.unpack('>I', checksum)[0]:
-                raise _damaged("a PNG's pixels fit their checksum", 'others')
+                raise damaged("a PNG's pixels fit their checksum", 'others')
             return _undo_sub(lines, png)
     _store(parts, checksum)
     file = b''.join((png.header, *parts, END))
@@ -175,15 +175,15 @@ def _inflate(data: bytes, png: PngFile) -> tuple[list[bytes], bytes]:
                 parts.append(stream.decompress(view[begin:end], left + 1))
                 left -= len(parts[-1])
                 if left < 0:
-                    raise _damaged(f'the pixels of {png.width} x {png.height} in a PNG are '
+                    raise damaged(f'the pixels of {png.width} x {png.height} in a PNG are '
                                    f'{size} bytes', 'more')
                 after = stream.unused_data[:4]
             if len(after) >= 4:
                 break
     except zlib.error as error:
-        raise _damaged("a PNG's pixels can be inflated", str(error)) from error
+        raise damaged("a PNG's pixels can be inflated", str(error)) from error
     if len(head) < 2 or head[0] & 15 != 8 or head[1] & 32 or int.from_bytes(head, 'big') % 31:
-        raise _damaged('the pixels of a PNG are a zlib stream', head)
+        raise damaged('the pixels of a PNG are a zlib stream', head)
     if left or len(after) < 4:
         raise _truncated(f'{size - left} of {size} bytes of pixels')
     return parts, after[:4]
@@ -221,10 +221,4 @@ def _undo_sub(lines: np.ndarray, png: PngFile) -> np.ndarray:
 
 
 def _truncated(received: object) -> ImageError:
-    return ImageError('a PNG is complete to its end chunk', received, 'the data is truncated: '
-                      'check the network and the camera driver, or copy the file again')
-
-
-def _damaged(rule: str, received: object) -> ImageError:
-    return ImageError(rule, received,
-                      'the data is damaged: check the camera driver, or copy the file again')
+    return truncated('a PNG is complete to its end chunk', received)
