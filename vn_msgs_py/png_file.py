@@ -97,7 +97,7 @@ def _read_header(fields: bytes) -> tuple[int, int, int, int, bool]:
     check_size(height, width)
     if depth not in DEPTHS.get(colour, ()) or compression or filtering or interlace > 1:
         raise damaged('a PNG header is of a kind that there is',
-                       (depth, colour, compression, filtering, interlace))
+                      (depth, colour, compression, filtering, interlace))
     return height, width, depth, colour, bool(interlace)
 
 
@@ -176,7 +176,7 @@ def _inflate(data: bytes, png: PngFile) -> tuple[list[bytes], bytes]:
                 left -= len(parts[-1])
                 if left < 0:
                     raise damaged(f'the pixels of {png.width} x {png.height} in a PNG are '
-                                   f'{size} bytes', 'more')
+                                  f'{size} bytes', 'more')
                 after = stream.unused_data[:4]
             if len(after) >= 4:
                 break
