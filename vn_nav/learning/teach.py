@@ -18,6 +18,7 @@ from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
 from vn_nav.learning.teaching import PRESET, SEARCHED, Place, Teaching
 from vn_nav.learning.trainer import STATE
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
 
@@ -126,7 +127,8 @@ def _config(args: argparse.Namespace, given: LoadedCheckpoint | None, minutes: f
             raise UserError('an encoder that learns is taught', f'{args.checkpoint}, whose '
                             'encoder is frozen', 'choose another --checkpoint')
         own |= {'pair_minutes': 0.0, 'stacked_frames': network.frames,
-                'track_goal': bool(network.moves), **{name: getattr(network, name) for name in (
+                'track_goal': bool(network.moves),
+                'action_filter': network.filter_name != NONE or not network.moves, **{name: getattr(network, name) for name in (
                     'architecture', 'channels', 'blocks', 'features', 'hidden', 'deconvolutions',
                     'pose_to_memory', 'pixel_mean', 'pixel_std')}}
     words = [f'{name}={value}' for name, value in own.items()]

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
+from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
 from vn_nav.policy.encoders import Fused, Matching, OneStream, TwoStreams
 from vn_nav.policy.heads import (
     GoalPose,
@@ -66,6 +67,10 @@ class NetworkConfig:
     # Spots of one place that the policy knows by heart; more than none: the memory also sees where
     # there picture and goal were taken, see `vn_nav.policy.places`.
     places: int = 0
+    # Of `vn_nav.policy.action_filter.FILTERS`: what whoever chooses actions by the logits puts in
+    # between, no part of the network. '': blocked actions where there are moves, as it was before
+    # checkpoints said so; else none.
+    action_filter: str = ''
     # Grey levels. Standardised input is what made learning work; whole numbers up to 256 less a
     # whole mean stay exact in bfloat16.
     pixel_mean: float = 120.0
@@ -102,6 +107,10 @@ class NetworkConfig:
             (not self.moves or (len(self.moves) == len(self.actions)
                                 and all(len(move) == 3 for move in self.moves)),
              'there is a move (dx, dy, dyaw) for each action', self.moves),
+            (self.filter_name in FILTERS, f'the action filter is one of {", ".join(FILTERS)}',
+             self.action_filter),
+            (self.filter_name == NONE or self.moves,
+             'an action filter is told what the actions do: it needs moves', self.action_filter),
             (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
                                   and self.architecture != 'icra2017'),
              'a policy with an LSTM knows none, or 2 to 1024 spots of a place', self.places),
@@ -118,6 +127,11 @@ class NetworkConfig:
         for kept, rule, received in rules:
             if not kept:
                 raise UserError(rule, received, 'correct the network configuration')
+
+    @property
+    def filter_name(self) -> str:
+        """The action filter, by its name in `vn_nav.policy.action_filter.FILTERS`."""
+        return self.action_filter or (BLOCKED_ACTIONS if self.moves else NONE)
 
 
 class PolicyOutput(NamedTuple):
