@@ -14,6 +14,7 @@ from vn_nav.bags.compare_drives import (
     compare,
     confusion_table,
     figures,
+    filter_words,
     markdown,
     read_shadow,
 )
@@ -118,7 +119,10 @@ def _told(folder: Path, driven) -> str:
     same, known = shadow.beside_the_drive
     arrived = sum(answer.choice == ARRIVED for answer in shadow.answers)
     return (f'{len(shadow.answers)} decisions, {same} of {known} as the drive, arrived '
-            f'{arrived} times, {len(shadow.commands)} commands; latency '
+            f'{arrived} times, {len(shadow.commands)} commands; '
+            + ('' if shadow.filtered is None
+               else f'action filter: {filter_words(shadow.filtered)}; ')
+            + 'latency '
             f'{np.median(driven.latencies) * 1e3:.0f} ms (p95 '
             f'{np.quantile(driven.latencies, 0.95) * 1e3:.0f})')
 

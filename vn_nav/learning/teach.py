@@ -128,7 +128,8 @@ def _config(args: argparse.Namespace, given: LoadedCheckpoint | None, minutes: f
                             'encoder is frozen', 'choose another --checkpoint')
         own |= {'pair_minutes': 0.0, 'stacked_frames': network.frames,
                 'track_goal': bool(network.moves),
-                'action_filter': network.filter_name != NONE or not network.moves, **{name: getattr(network, name) for name in (
+                'action_filter': network.filter_name != NONE or not network.moves,
+                **{name: getattr(network, name) for name in (
                     'architecture', 'channels', 'blocks', 'features', 'hidden', 'deconvolutions',
                     'pose_to_memory', 'pixel_mean', 'pixel_std')}}
     words = [f'{name}={value}' for name, value in own.items()]

@@ -16,6 +16,7 @@ from vn_msgs_py import images
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.window import Window
 from vn_nav.observation import crop_fraction, needed_side, preprocess
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
@@ -106,6 +107,14 @@ class DecisionWorker:
             if self._goal is None and self._goal_in_force is not None:
                 self._goal = self._goal_in_force
                 self._wake.notify_all()
+
+    def filter_values(self) -> dict[str, str | int]:
+        """What diagnostics say of the action filter: its name, and its counts until now."""
+        counts = self._runtime.filter_counts
+        return {'action_filter': self._runtime.action_filter} | (
+            {} if self._runtime.action_filter == NONE else {
+                'filter_decisions': counts.decisions, 'filter_acted': counts.acted,
+                'filter_changed': counts.changed})
 
     def check_fov(self) -> None:
         """Raise UserError where the camera sees less than the policy needs."""

@@ -336,7 +336,8 @@ class PolicyNode(LifecycleNode):
         with self._wake:
             state, reason = self.navigator.state, self.navigator.reason
             fov, gate = self._worker.camera_fov, self.navigator.gate
-            values = {'decisions': self.navigator.decisions, **self._inputs.values(),
+            values = {'decisions': self.navigator.decisions, **self._worker.filter_values(),
+                      **self._inputs.values(),
                       'camera_fov_deg': round(math.degrees(fov), 1) if fov else 'unknown',
                       **{f'dropped: {kind}': n for kind, n in gate.dropped.items()},
                       **({'last_dropped': gate.last} if gate.last else {}),

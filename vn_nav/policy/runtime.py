@@ -159,14 +159,14 @@ class PolicyRuntime:
         actions, _, acted, changed = choose_filtered(output.logits[0], offsets, self.decoding,
                                                      self._generator)
         action = int(actions)
-        if self._filter is not None:
-            self.filter_counts.add(*acted, *changed)
         if output.arrival is not None:
             arrival = float(torch.sigmoid(output.arrival[0, 0]))
             if not math.isfinite(arrival):
                 raise FloatingPointError('the arrival of the policy is not finite')
             self.arrival = arrival
         self._state, self._last_action = state, action
+        if self._filter is not None:  # where the policy declares its stop nothing is driven
+            self.filter_counts.add(acted[0] and not self.arrived, changed[0] and not self.arrived)
         if self.arrived:
             self.reset()
         return action
