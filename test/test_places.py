@@ -17,7 +17,7 @@ from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spo
 from vn_nav.learning.teaching import _widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import NetworkConfig, Policy
-from vn_nav.policy.places import HEADINGS, LookAround
+from vn_nav.policy.places import HEADINGS, MultiViewAveraging
 from vn_sim_bridge.backends.image_graph import ImageGraphBackend
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.graph_views import GraphViews
@@ -154,7 +154,7 @@ def test_imitation_reaches_what_is_acted_upon():
 
 
 def test_who_turns_on_the_spot_knows_it_by_all_its_pictures():
-    around = LookAround(((0.5, 0, 0), (-0.2, 0, 0), (0, 0, 0.5), (0, 0, -0.5)), 3)
+    around = MultiViewAveraging(((0.5, 0, 0), (-0.2, 0, 0), (0, 0, 0.5), (0, 0, -0.5)), 3)
     here = torch.rand(7, 1, 3 + HEADINGS)
     actions = torch.tensor([-1, 2, 3, 0, 2, 2, 3])[:, None]
     starts = torch.tensor([True, False, False, False, False, True, False])[:, None]

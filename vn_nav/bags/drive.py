@@ -44,7 +44,7 @@ def find_topics(bag: str | Path, wanted: Topics) -> Topics:
     return wanted.within({name: topic.type for name, topic in summary(bag).items()})
 
 
-def hear(bag: str | Path, topics: Topics) -> Iterator[Heard]:
+def hear(bag: str | Path, topics: Topics) -> Iterator[TimestampedMessage]:
     """The messages of a drive in the order of recording, one take after the other.
 
     Args:
@@ -56,10 +56,10 @@ def hear(bag: str | Path, topics: Topics) -> Iterator[Heard]:
     """
     names = tuple(filter(None, dataclasses.astuple(topics)))
     for m in messages(bag, names, clocks=(topics.image, topics.odometry or topics.command)):
-        yield Heard(m.topic, m.message, m.time)
+        yield TimestampedMessage(m.topic, m.message, m.time)
 
 
-class Heard(NamedTuple):
+class TimestampedMessage(NamedTuple):
     """A message of a bag, in the order of recording."""
 
     topic: str
@@ -102,7 +102,8 @@ class Report:
         return self.misfits / max(self.misfits + sum(self.actions.values()), 1)
 
 
-def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> Iterator[Frame]:
+def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: Report
+                ) -> Iterator[Frame]:
     """Camera pictures with their poses, in order, one episode after the other.
 
     Poses are interpolated between the odometry before and after a picture, if the nearer of the

@@ -24,7 +24,15 @@ from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav import __version__
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.drive import COMMAND_LASTS, Frame, Heard, Report, find_topics, hear, synchronise
+from vn_nav.bags.drive import (
+    COMMAND_LASTS,
+    Frame,
+    Report,
+    TimestampedMessage,
+    find_topics,
+    hear,
+    synchronise,
+)
 from vn_nav.bags.lerobot_stats import Colours, describe, merge
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.stamped import set_back
@@ -223,7 +231,7 @@ class _Dataset:
     def _acted(self) -> str:
         return 'commanded' if self._topics.command else 'measured (no commands were recorded)'
 
-    def _heard(self, bag: str | Path) -> Iterator[Heard]:
+    def _heard(self, bag: str | Path) -> Iterator[TimestampedMessage]:
         for m in hear(bag, self._topics):
             try:
                 if m.topic == self._topics.command:

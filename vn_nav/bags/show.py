@@ -18,7 +18,15 @@ from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.agreement import Agreement, judge
 from vn_nav.bags.doctor import diagnose
 from vn_nav.bags.doctor_figures import Diagnosis
-from vn_nav.bags.drive import Cutter, Frame, Heard, Report, find_topics, hear, synchronise
+from vn_nav.bags.drive import (
+    Cutter,
+    Frame,
+    Report,
+    TimestampedMessage,
+    find_topics,
+    hear,
+    synchronise,
+)
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.show_figures import Film, Goals, Odometer, Shot, Timeline, Ways
 from vn_nav.robot import RobotSpec
@@ -88,7 +96,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
     return shown
 
 
-def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[Heard]:
+def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[TimestampedMessage]:
     """The messages of a drive; velocities are noted as they pass."""
     for m in hear(bag, names):
         kind = {names.command: 'commanded', names.odometry: 'measured'}.get(m.topic)

@@ -44,7 +44,7 @@ def spread_spots(positions: np.ndarray, count: int) -> np.ndarray:
 def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarray, *,
                minutes: float, say: Callable[[str], None], least: int = 0,
                show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
-    """Fit the recogniser of a network to a place.
+    """Fit the classifier of a network to a place.
 
     Cross-entropy with the spots and headings about the true pose (Banino et al. 2018).
 
@@ -95,7 +95,7 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
 def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets: np.ndarray, *,
                until: float, say: Callable[[str], None], seed: int = 0, least: int = 1,
                show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
-    """Teach `Routes` the shortest ways, by what the recogniser says of pictures.
+    """Teach `Routes` the shortest ways, by what the classifier says of pictures.
 
     Cross-entropy with `softened` choices. Each picture is recognised once, and a hundred thousand
     ways a second are learned from.
@@ -144,7 +144,7 @@ def _share(time_share: float, seen: int, least: int) -> float:
 
 @torch.no_grad()
 def recognise(network: Policy, pictures: np.ndarray) -> Tensor:
-    """What the recogniser says of pictures [N,3,S,S], [N,K+16]."""
+    """What the classifier says of pictures [N,3,S,S], [N,K+16]."""
     return torch.cat([network.places(part, network.compute_dtype)
                       for part in torch.from_numpy(pictures).split(BATCH)])
 
@@ -168,7 +168,7 @@ def errors(network: Policy, views: Views) -> tuple[float, float]:
 
 
 def _targets(spots: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """What the recogniser should say of poses [N,3]: [N,K] and [N,16]."""
+    """What the classifier should say of poses [N,3]: [N,K] and [N,16]."""
     gap = torch.cdist(poses[:, :2].float(), spots)
     turn = poses[:, 2:].float() - heading_cells()
     turn = torch.atan2(torch.sin(turn), torch.cos(turn))

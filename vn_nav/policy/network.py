@@ -32,7 +32,7 @@ from vn_nav.policy.memory import (
     RecurrentState,
     stack_frames,
 )
-from vn_nav.policy.places import WIDTH, LookAround, PlaceRecogniser, Routes
+from vn_nav.policy.places import WIDTH, MultiViewAveraging, PlaceClassifier, Routes
 from vn_nav.policy.zhu import FROZEN, SceneLinear, Siamese
 
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
@@ -64,8 +64,8 @@ class NetworkConfig:
     # [A,3] dx, dy [m], dyaw [rad] of the actions: with them the memory also sees where the goal
     # stands by dead reckoning since it was seen, see `GoalTracker`. Empty: it does not.
     moves: tuple[tuple[float, float, float], ...] = ()
-    # Spots of one place that the policy knows by heart; more than none: the memory also sees where
-    # there picture and goal were taken, see `vn_nav.policy.places`.
+    # Place cells of the one place that the policy recognises; more than none: the memory also sees
+    # where there picture and goal were taken, see `vn_nav.policy.places`.
     places: int = 0
     # Of `vn_nav.policy.action_filter.FILTERS`: what whoever chooses actions by the logits puts in
     # between, no part of the network. '': blocked actions where there are moves, as it was before
@@ -113,7 +113,7 @@ class NetworkConfig:
              'an action filter is told what the actions do: it needs moves', self.action_filter),
             (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
                                   and self.architecture != 'icra2017'),
-             'a policy with an LSTM knows none, or 2 to 1024 spots of a place', self.places),
+             'a policy with an LSTM has no place cells, or 2 to 1024', self.places),
             (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
             (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
              'one', self.frozen),
@@ -192,8 +192,8 @@ class Policy(nn.Module):
         self.places = self.routes = self.around = None
         if config.places:
             if config.moves:
-                self.around = LookAround(config.moves, config.places)
-            self.places = PlaceRecogniser(config.size, config.places, config.pixel_mean,
+                self.around = MultiViewAveraging(config.moves, config.places)
+            self.places = PlaceClassifier(config.size, config.places, config.pixel_mean,
                                           config.pixel_std)
             self.routes = Routes(self.places.width, len(config.actions))
             with torch.no_grad():
@@ -258,7 +258,7 @@ class Policy(nn.Module):
 
     @property
     def _beside(self) -> tuple[int, int]:
-        """Numbers that are remembered beside the memory's own, by tracker and look around."""
+        """Numbers that are remembered beside the memory's own, by tracker and multi-view averaging."""
         return (0 if self.tracker is None else GoalTracker.WIDTH,
                 0 if self.around is None else self.around.width)
 
