@@ -258,7 +258,7 @@ class Policy(nn.Module):
 
     @property
     def _beside(self) -> tuple[int, int]:
-        """Numbers that are remembered beside the memory's own, by tracker and multi-view averaging."""
+        """Numbers that are remembered beside the memory's: by tracker, by multi-view averaging."""
         return (0 if self.tracker is None else GoalTracker.WIDTH,
                 0 if self.around is None else self.around.width)
 

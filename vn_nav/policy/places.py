@@ -3,8 +3,8 @@
 A policy for any house compares picture and goal, and looks for the goal where it sees nothing of
 it. In a place that it was shown it can know where the goal stands instead. The classifier answers
 as the place cells and head-direction cells of Banino et al. 2018 (Nature 557): probabilities over
-place cells on the floor and over headings, which can say "here or there" where a pose (Kendall et al.
-2015, PoseNet) would have to lie in between.
+place cells on the floor and over headings, which can say "here or there" where a pose (Kendall et
+al. 2015, PoseNet) would have to lie in between.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class PlaceClassifier(nn.Module):
         return self.third, self.trunk, self.out
 
     def scores(self, pictures: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Log-probabilities of place cells [N,K] and headings [N,16] of pictures [N,3,S,S]; float32."""
+        """Log-probabilities of place cells [N,K] and headings [N,16], float32; of [N,3,S,S]."""
         x = F.relu(apply(self.second, F.relu(self.first(pictures, dtype))))
         x = Matching.SCALE * directions(apply(self.key, x))
         x = F.relu(apply(self.third, x))
@@ -119,8 +119,8 @@ class MultiViewAveraging(nn.Module):
             before: [B,K+1] remembered from before the first row.
 
         Returns:
-            [T,B,K+16], place cells averaged and headings as they are, and what is remembered after the
-            last row.
+            [T,B,K+16], place cells averaged and headings as they are, and what is remembered
+            after the last row.
         """
         keep = (self.stays[last_action] & ~starts.unsqueeze(2)).to(before.dtype)
         spots = here[..., :self.width - 1].to(before.dtype)
