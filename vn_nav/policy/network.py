@@ -83,6 +83,8 @@ class NetworkConfig:
         for name in ('actions', 'channels', 'heads'):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         object.__setattr__(self, 'moves', tuple(map(tuple, self.moves)))
+        if self.action_filter == self._usual_filter:  # said or not, it is the same
+            object.__setattr__(self, 'action_filter', '')
         rules = (
             (len(self.actions) >= 2 and len(set(self.actions)) == len(self.actions),
              'a policy has at least two actions with distinct names', self.actions),
@@ -131,7 +133,11 @@ class NetworkConfig:
     @property
     def filter_name(self) -> str:
         """The action filter, by its name in `vn_nav.policy.action_filter.FILTERS`."""
-        return self.action_filter or (BLOCKED_ACTIONS if self.moves else NONE)
+        return self.action_filter or self._usual_filter
+
+    @property
+    def _usual_filter(self) -> str:
+        return BLOCKED_ACTIONS if self.moves else NONE
 
 
 class PolicyOutput(NamedTuple):
