@@ -20,7 +20,7 @@ from vn_nav.learning.rollout import Collector
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 FACTS = {'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
 CONFIG = TrainConfig(frames=900, rollout_length=16, channels=(8, 8, 8), features=24, hidden=16,

@@ -12,11 +12,12 @@ from vn_msgs_py.camera import fill_camera_info
 from vn_msgs_py.motion import yaw_to_quaternion
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
-from vn_sim_bridge import bridge_messages, lidar
+from vn_sim_bridge import bridge_messages
 from vn_sim_bridge.bridge_messages import Frames
 from vn_sim_bridge.bridge_parameters import DAY, first_stamp
-from vn_sim_bridge.odometry import Uncertainty, advance
-from vn_sim_bridge.simulated_robot import TICK, SimulatedRobot
+from vn_sim_bridge.robot import lidar
+from vn_sim_bridge.robot.odometry import Uncertainty, advance
+from vn_sim_bridge.robot.simulated_robot import TICK, SimulatedRobot
 
 pytestmark = pytest.mark.ros
 FRAMES = Frames.with_prefix('')

@@ -33,11 +33,11 @@ from vn_nav.policy.motion import ActionExecutor
 from vn_nav.resources import share_file
 from vn_nav.robot import AXES, Action, RobotSpec, load_robot
 from vn_sim_bridge.bridge_messages import odom_in_map
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
-from vn_sim_bridge.goal_pictures import GoalPicture, save_goal_pictures
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.simulated_robot import TERMINATED, TICK, SimulatedRobot
-from vn_sim_bridge.tasks import wrap_angle
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.tasks import wrap_angle
+from vn_sim_bridge.robot.goal_pictures import GoalPicture, save_goal_pictures
+from vn_sim_bridge.robot.simulated_robot import TERMINATED, TICK, SimulatedRobot
 
 pytestmark = pytest.mark.ros
 DEMO_BASE = str(share_file('config/robots/demo_base.yaml'))
@@ -545,8 +545,8 @@ def test_nothing_is_compiled_once_the_robot_runs():
     code = """
 import numba.core.dispatcher as dispatcher, numpy as np
 from vn_nav.robot import RobotSpec
-from vn_sim_bridge.randomisation import load_randomisation
-from vn_sim_bridge.simulated_robot import SimulatedRobot
+from vn_sim_bridge.render.randomisation import load_randomisation
+from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
 robot = SimulatedRobot(7, 2, robot=RobotSpec(), size=40, randomisation=load_randomisation('rough'))
 robot.begin_episode(0)
 robot.goal_frames()

@@ -10,7 +10,7 @@ from ros_harness import write_checkpoint
 
 from vn_nav.cli import main
 from vn_nav.policy.checkpoint import CONFIG
-from vn_sim_bridge.world import WORLD_VERSION
+from vn_sim_bridge.floor.contacts import WORLD_VERSION
 
 
 def run(*words):

@@ -15,8 +15,8 @@ from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.robot import load_robot
-from vn_sim_bridge.randomisation import load_randomisation
-from vn_sim_bridge.simulated_robot import SimulatedRobot
+from vn_sim_bridge.render.randomisation import load_randomisation
+from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
 
 EPISODES = 6
 BAG = Path(__file__).resolve().parent.parent / 'bags' / 'house_drive'

@@ -22,7 +22,7 @@ from vn_nav.learning.state_file import read_state
 from vn_nav.learning.trainer import STATE, train
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 TOLD = ('depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap')
@@ -39,7 +39,7 @@ def one_thread():
 
 
 def device_env(config=CONFIG):
-    from vn_sim_bridge.warp_env import WarpNavigationEnv
+    from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     return WarpNavigationEnv(config, device='cpu')
 
 

@@ -18,7 +18,7 @@ from vn_nav.evaluation.evaluator import (
 from vn_nav.evaluation.metrics import Episode
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 ROWS = ['right goal, sample', 'right goal, greedy', 'wrong goal', 'blank goal', 'random actions',
         'shortest path']

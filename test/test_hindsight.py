@@ -19,7 +19,7 @@ from vn_nav.learning.hindsight import (
     split,
 )
 from vn_nav.overlap import lift, overlap
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 STEPS = 100  # of a robot in a house
 

@@ -21,8 +21,8 @@ from vn_nav.policy.resnet import ResNet50, load_frozen_weights
 from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.zhu import RandomFeatures, scene_numbers
 from vn_nav.robot import DRIVE_ACTIONS
-from vn_sim_bridge import tasks
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation import tasks
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 ZHU = NetworkConfig(actions=DRIVE_ACTIONS, size=36, architecture='icra2017', hidden=24, frames=4)
 SCENES = dataclasses.replace(ZHU, scenes=3)

@@ -17,7 +17,7 @@ from vn_sim_bridge.houses.mesh import load_mesh
 from vn_sim_bridge.houses.mesh_export import export_mesh
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.render.rasterizer import Rasterizer
-from vn_sim_bridge.scene import uniform_light
+from vn_sim_bridge.render.scene import uniform_light
 
 FOV = math.radians(90)
 CUBE = """

@@ -7,8 +7,8 @@ import pytest
 
 from vn_nav.overlap import FARTHEST, GRID, lift, overlap, relative_pose
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
-from vn_sim_bridge.randomisation import load_randomisation
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.render.randomisation import load_randomisation
 
 
 @pytest.fixture(scope='module')

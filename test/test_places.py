@@ -18,12 +18,12 @@ from vn_nav.learning.teaching import _widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.policy.places import HEADINGS, LookAround
-from vn_sim_bridge.backends.image_graph import ImageGraphBackend
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.graph_views import GraphViews
-from vn_sim_bridge.pose_map import MOST
-from vn_sim_bridge.relight import draw_light, relight
-from vn_sim_bridge.teach import make_views, regrets
+from vn_sim_bridge.datasets.recorded_views import GraphViews
+from vn_sim_bridge.recorded.pose_lattice import MOST
+from vn_sim_bridge.recorded.relight import draw_light, relight
+from vn_sim_bridge.simulators.recorded import ImageGraphBackend
+from vn_sim_bridge.teach_place import make_views, regrets
 
 SIDE = 36
 CONFIG = NetworkConfig(actions=ROBOT.action_names, size=SIDE, channels=(8, 8, 8), features=16,

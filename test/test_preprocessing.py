@@ -11,7 +11,7 @@ from vn_nav.bags.reader import read_bag
 from vn_nav.bags.recorder import BagWriter
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 pytestmark = pytest.mark.ros
 

@@ -36,8 +36,8 @@ from vn_nav.nodes.ros_env import RosEnv
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
-from vn_sim_bridge.world import WORLD_VERSION
+from vn_sim_bridge.floor.contacts import WORLD_VERSION
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 pytestmark = pytest.mark.ros
 BASE = share_file('config/robots/demo_base.yaml')

@@ -39,13 +39,13 @@ from vn_nav.learning.teaching import OWN
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
-from vn_sim_bridge.backends.house import HouseBackend
+from vn_sim_bridge.floor.contacts import WORLD_VERSION
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.image_graph import build_graph
-from vn_sim_bridge.joystick import Joystick
-from vn_sim_bridge.simulated_robot import TICK
-from vn_sim_bridge.teach import draw_map, held_out, make_env, make_pairs
-from vn_sim_bridge.world import WORLD_VERSION
+from vn_sim_bridge.recorded.image_graph import build_graph
+from vn_sim_bridge.robot.joystick import Joystick
+from vn_sim_bridge.robot.simulated_robot import TICK
+from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.teach_place import draw_map, held_out, make_env, make_pairs
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 SIZE = 36

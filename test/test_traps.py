@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from vn_nav.learning.presets import ENVIRONMENT
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 HERE = Path(__file__).parent
 # Number in thesis-facts.md, section 6; the trap; the tests (of this file: without a file's name).
@@ -145,8 +145,8 @@ RESIZES = ('resize', 'interpolate', 'grid_sample', 'Upsample')
 # Functions that resize pictures: of cameras, of textures, for people, for frozen features, and to
 # tell a black or frozen camera.
 MAY_RESIZE = {
-    'vn_nav/observation.py', 'vn_sim_bridge/scene.py', 'vn_sim_bridge/houses/textures.py',
-    'vn_sim_bridge/houses/contact_sheet.py', 'vn_sim_bridge/houses/walk.py',
+    'vn_nav/observation.py', 'vn_sim_bridge/render/scene.py', 'vn_sim_bridge/houses/textures.py',
+    'vn_sim_bridge/tools/contact_sheet.py', 'vn_sim_bridge/tools/walk.py',
     'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor.py',
     'vn_nav/bags/show_figures.py',  # thumbnails for a page
 }

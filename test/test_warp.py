@@ -10,11 +10,11 @@ import pytest
 
 from vn_nav.errors import UserError
 from vn_sim_bridge.counter_random import Stream, key
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
 from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.randomisation import draw_appearance, load_randomisation
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 from vn_sim_bridge.render.pack import Lights, Objects
+from vn_sim_bridge.render.randomisation import draw_appearance, load_randomisation
 from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.sensor import expose
 
@@ -67,7 +67,7 @@ def test_pictures_agree_with_numba(size):
 def test_episodes_agree_with_the_environment(mode):
     import torch
 
-    from vn_sim_bridge.warp_env import WarpNavigationEnv
+    from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     randomisation = dataclasses.replace(load_randomisation('rough'), late_picture=0.0)
     config = EnvConfig(
         houses=(7, 3, 12_001), rooms=4, num_envs=24, size=48, max_decisions=20,
@@ -105,7 +105,7 @@ def test_episodes_agree_with_the_environment(mode):
 def test_observations_share_the_devices_memory():
     import torch
 
-    from vn_sim_bridge.warp_env import WarpNavigationEnv
+    from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     env = WarpNavigationEnv(EnvConfig(houses=(7,), rooms=1, num_envs=2, size=32), device='cpu')
     observation, _ = env.reset(seed=0)
     address = observation['image'].data_ptr()
@@ -121,7 +121,7 @@ def test_observations_share_the_devices_memory():
 
 
 @pytest.mark.parametrize('module', ['vn_sim_bridge.render.warp_renderer',
-                                    'vn_sim_bridge.warp_env'])
+                                    'vn_sim_bridge.navigation.warp_env'])
 def test_the_kernels_compile_for_a_gpu(tmp_path, module):
     code = (f'import importlib, warp as wp\nm = importlib.import_module({module!r})\n'
             f'print(wp.compile_aot_module(m, arch=90, module_dir={str(tmp_path)!r}))')

@@ -123,9 +123,9 @@ def run_collect(args) -> int:
     check_backend(args.backend)
     from vn_nav.bags.recorder import BagWriter
     from vn_nav.robot import RobotSpec, load_robot
-    from vn_sim_bridge.collect import collect, house_scenes
+    from vn_sim_bridge.datasets.collect import collect, house_scenes
     from vn_sim_bridge.houses.splits import SPLITS
-    from vn_sim_bridge.randomisation import load_randomisation
+    from vn_sim_bridge.render.randomisation import load_randomisation
     if args.house and args.houses:
         raise UserError('pictures are of named houses or of the first N', '--house and --houses',
                         'give one of them')
@@ -151,8 +151,8 @@ def run_train(args) -> int:
     if args.env == 'ros':
         return _train_over_ros(args)
     from vn_nav.learning.trainer import train
-    from vn_sim_bridge.env import PRIVILEGED
     from vn_sim_bridge.houses.splits import SPLITS
+    from vn_sim_bridge.navigation.env import PRIVILEGED
     houses = args.house or list(SPLITS['train'][:args.houses or 1])
     config, world = train_config(args), world_options(args)
     env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
@@ -250,9 +250,9 @@ def _pair_sources(args, config):
     """Makes the pairs that a training begins with, and those of validation houses."""
     def make():
         from vn_nav.robot import load_robot
+        from vn_sim_bridge.datasets.house_pairs import PairSampler
         from vn_sim_bridge.houses.splits import SPLITS
-        from vn_sim_bridge.pairs import PairSampler
-        from vn_sim_bridge.randomisation import load_randomisation
+        from vn_sim_bridge.render.randomisation import load_randomisation
         options = {'rooms': args.rooms, 'size': args.size, 'threads': config.threads,
                    'robot': load_robot(args.robot) if args.robot else None,
                    'randomisation': load_randomisation(args.randomisation)}
@@ -264,7 +264,7 @@ def _pair_sources(args, config):
 def run_teach(args) -> int:
     """`vn_nav teach`."""
     from vn_nav.learning.teach import teach
-    from vn_sim_bridge import teach as place
+    from vn_sim_bridge import teach_place as place
     return teach(args, place)
 
 
@@ -298,9 +298,9 @@ def run_demo(args) -> int:
 
 def run_house_show(args) -> int:
     """`vn_nav house show`."""
-    from vn_sim_bridge.houses.contact_sheet import write_contact_sheet
     from vn_sim_bridge.houses.procedural import generate_house
-    from vn_sim_bridge.randomisation import load_randomisation
+    from vn_sim_bridge.render.randomisation import load_randomisation
+    from vn_sim_bridge.tools.contact_sheet import write_contact_sheet
     house = generate_house(args.seed, rooms=args.rooms)
     path = args.out or Path(f'house-{args.seed}.png')
     write_contact_sheet(path, house, load_randomisation(args.randomisation))
@@ -313,8 +313,8 @@ def run_house_show(args) -> int:
 def run_house_walk(args) -> int:
     """`vn_nav house walk`."""
     from vn_sim_bridge.houses.procedural import generate_house
-    from vn_sim_bridge.houses.walk import walk
-    from vn_sim_bridge.randomisation import load_randomisation
+    from vn_sim_bridge.render.randomisation import load_randomisation
+    from vn_sim_bridge.tools.walk import walk
     walk(generate_house(args.seed, rooms=args.rooms), load_randomisation(args.randomisation))
     return 0
 

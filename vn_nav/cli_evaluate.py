@@ -101,7 +101,7 @@ def run_evaluate(args: argparse.Namespace) -> int:
 
 def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
     """The houses of each split, and what measures in them."""
-    from vn_sim_bridge.world import WORLD_VERSION
+    from vn_sim_bridge.floor.contacts import WORLD_VERSION
     check_world(checkpoint.info, WORLD_VERSION)
     rooms = args.rooms or checkpoint.info['rooms']
     if rooms is None:
@@ -123,7 +123,7 @@ def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[di
     """The goals of each split in a recorded drive, and what measures there."""
     from vn_nav.bags.recorded_place import read_place
     from vn_nav.evaluation import evaluator
-    from vn_sim_bridge import teach as place
+    from vn_sim_bridge import teach_place as place
     info = checkpoint.info
     graph = read_place(args, place.build_graph, robot, checkpoint.config.size, cache)
     check_world(info, graph.world_version)

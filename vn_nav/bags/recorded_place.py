@@ -63,7 +63,7 @@ def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec
 
     Args:
         args: `bag` and the options of `add_place_options`.
-        build_graph: of the simulator's half, `vn_sim_bridge.image_graph.build_graph`.
+        build_graph: of the simulator's half, `vn_sim_bridge.recorded.image_graph.build_graph`.
         robot: that drove, with the policy's actions.
         size: side of the pictures [pixels].
         cache: folder of decoded bags.

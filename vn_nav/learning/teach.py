@@ -1,7 +1,7 @@
 """`vn_nav teach`: a policy for the place where a bag was driven, learned in the bag's pictures.
 
 The simulator's half, which makes a place out of pictures with poses, comes from the caller
-(`vn_sim_bridge.teach`).
+(`vn_sim_bridge.teach_place`).
 """
 
 from __future__ import annotations
