@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from common import pin
 
-from vn_nav.cli_world import machine
+from vn_nav.cli.world import machine
 from vn_nav.learning.pairs import PairConfig, look, pretrain_pairs
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS

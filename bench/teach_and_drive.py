@@ -42,16 +42,17 @@ from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.motion import fill_twist, odometry_to_array
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS, arrived, wrap_angle
 from vn_nav.bags.reader import read_bag
-from vn_nav.cli_world import machine
-from vn_nav.demo import LINE, Processes, ProcessFailure
+from vn_nav.cli.demo import LINE
+from vn_nav.cli.world import machine
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.evaluation.evaluator import ARRIVAL, DECLARED, STOP_THRESHOLD
 from vn_nav.evaluation.metrics import Episode, summarise
-from vn_nav.evaluation.tables import print_rows
+from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.observation import preprocess
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.report.tables import print_rows
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
 from vn_sim_bridge.houses.procedural import generate_house

@@ -10,9 +10,9 @@ import pytest
 
 from vn_nav.cli import main
 from vn_nav.errors import UserError
-from vn_nav.evaluation.chart import log_ticks, short, ticks
-from vn_nav.evaluation.compare import cells
-from vn_nav.evaluation.curves import average, grouped, reached, read_runs, summary
+from vn_nav.report.chart import log_ticks, short, ticks
+from vn_nav.report.compare import cells
+from vn_nav.report.curves import average, grouped, reached, read_runs, summary
 
 FRAMES = np.arange(1000, 100_001, 1000)
 

@@ -10,8 +10,8 @@ from ros_harness import write_checkpoint
 from rosbags.highlevel import AnyReader
 
 from vn_nav.cli import main
-from vn_nav.cli_world import make_env
-from vn_nav.demo import SEED, control_env
+from vn_nav.cli.demo import SEED, control_env
+from vn_nav.cli.world import make_env
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.resources import share_file

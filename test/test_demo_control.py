@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from ros_harness import write_checkpoint
 
-from vn_nav import demo
-from vn_nav.cli_world import make_env
-from vn_nav.evaluation import report, terminal
+from vn_nav.cli import demo
+from vn_nav.cli.world import make_env
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.report import demo_page as report
+from vn_nav.report import terminal
 from vn_nav.robot import load_robot
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.simulated_robot import SimulatedRobot

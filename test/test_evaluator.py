@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from vn_nav.evaluation.evaluation_page import choose, evaluation_page, outcome
 from vn_nav.evaluation.evaluator import (
     PolicyActor,
     by_scene,
@@ -17,6 +16,7 @@ from vn_nav.evaluation.evaluator import (
 )
 from vn_nav.evaluation.metrics import Episode
 from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.report.evaluation_page import choose, evaluation_page, outcome
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 

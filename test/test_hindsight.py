@@ -9,6 +9,7 @@ from round_room import ROBOT, drive_set, look
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.bags.dataset import DriveSet
 from vn_nav.bags.drive import MISFIT
+from vn_nav.co_visibility import lift, overlap
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import (
     Drives,
@@ -18,7 +19,6 @@ from vn_nav.learning.hindsight import (
     rows_of,
     split,
 )
-from vn_nav.overlap import lift, overlap
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 STEPS = 100  # of a robot in a house

@@ -46,7 +46,7 @@ def prefix(tmp_path):
     for name in ('launch', 'config', 'models', 'package.xml'):
         (share / name).symlink_to(ROOT / name)
     for name in ('policy_node', 'sim_bridge_node'):
-        (lib / name).write_text(f'#!{sys.executable}\nimport sys\nfrom vn_nav.cli_nodes import '
+        (lib / name).write_text(f'#!{sys.executable}\nimport sys\nfrom vn_nav.cli.nodes import '
                                 f'{name}\nsys.exit({name}())\n')
         (lib / name).chmod(0o755)
     return tmp_path / 'prefix'

@@ -20,8 +20,8 @@ NODES = {'goal_node': 'vn_nav.nodes.goal_node', 'policy_node': 'vn_nav.nodes.pol
          'recorder_node': 'vn_nav.nodes.recorder_node',
          'sim_bridge_node': 'vn_sim_bridge.bridge_node'}
 ENDING = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT]
-EXECUTABLE = 'import sys; sys.argv[0] = "node"; from vn_nav import cli_nodes; ' \
-    'sys.exit(cli_nodes.{}())'
+EXECUTABLE = 'import sys; sys.argv[0] = "node"; from vn_nav.cli import nodes; ' \
+    'sys.exit(nodes.{}())'
 
 
 def run(name, *words, **options):

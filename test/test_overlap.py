@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from vn_nav.overlap import FARTHEST, GRID, lift, overlap, relative_pose
+from vn_nav.co_visibility import FARTHEST, GRID, lift, overlap, relative_pose
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 from vn_sim_bridge.render.randomisation import load_randomisation

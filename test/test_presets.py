@@ -6,8 +6,8 @@ import re
 
 import pytest
 
+from vn_nav.cli.train import add_train_options, train_config
 from vn_nav.errors import UserError
-from vn_nav.learning.command import add_train_options, train_config
 from vn_nav.learning.learner import TASKS
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.robot import DRIVE_ACTIONS

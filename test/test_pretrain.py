@@ -11,7 +11,6 @@ from round_room import ROBOT, drive_set
 
 from vn_nav.cli import main
 from vn_nav.errors import UserError
-from vn_nav.evaluation.compare import compare
 from vn_nav.learning.auxiliary import POSE_OVERLAP, image_target
 from vn_nav.learning.hindsight import Drives, partners, rows_of, split
 from vn_nav.learning.pairs import errors, measure
@@ -22,6 +21,7 @@ from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.heads import Pose
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.report.compare import compare
 
 FACTS = {'world_version': 'a round room', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
 EVERYTHING = ('goal_pose', 'arrival', 'distance', 'depth', 'segmentation', 'goal_segmentation')

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from vn_nav.co_visibility import relative_pose
 from vn_nav.errors import UserError
-from vn_nav.overlap import relative_pose
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.memory import GoalTracker
 from vn_nav.policy.network import NetworkConfig, Policy

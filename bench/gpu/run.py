@@ -71,7 +71,7 @@ def jobs(arguments) -> list[str]:
 
 def hardware(device: str) -> str:
     """The GPU in words, or the processor."""
-    from vn_nav.cli_world import machine
+    from vn_nav.cli.world import machine
     return machine(device)
 
 

@@ -14,8 +14,8 @@ from vn_nav.bags.doctor_figures import ERROR, Finding, TopicFigures
 from vn_nav.bags.drive import COARSE, COMMAND_LASTS
 from vn_nav.bags.show import AXES, Shown
 from vn_nav.bags.show_figures import STRIP, Shot, Timeline
-from vn_nav.evaluation.chart import Line, Series, Shape, Text, legend, panel, ticks, to_svg
-from vn_nav.evaluation.page import CURVES, cards, page, picture, table
+from vn_nav.report.chart import Line, Series, Shape, Text, legend, panel, ticks, to_svg
+from vn_nav.report.page import CURVES, cards, page, picture, table
 
 TOPICS = 60  # told one by one, at most
 MAP = 620, 470  # pixels

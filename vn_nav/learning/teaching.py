@@ -20,8 +20,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from vn_nav.cli.evaluate import DRIVE_SPLITS
 from vn_nav.evaluation import evaluator
-from vn_nav.evaluation.command import DRIVE_SPLITS
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BANK, BATCH, Views, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig

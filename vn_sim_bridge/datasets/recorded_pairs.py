@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
+from vn_nav.co_visibility import lift, overlap, relative_pose
 from vn_nav.errors import UserError
-from vn_nav.overlap import lift, overlap, relative_pose
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, uniform
 from vn_sim_bridge.datasets.house_pairs import BEHIND, CLOSE, NEARBY

@@ -14,8 +14,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from vn_nav.co_visibility import GRID, lift, overlap, relative_pose
 from vn_nav.errors import UserError
-from vn_nav.overlap import GRID, lift, overlap, relative_pose
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.floor.contacts import motion_noise

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 import warp as wp
 
+from vn_nav.co_visibility import GRID, SLACK, TOLERANCE, lift
 from vn_nav.errors import UserError
-from vn_nav.overlap import GRID, SLACK, TOLERANCE, lift
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.floor.contacts import (

@@ -17,9 +17,9 @@ import numba
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
+from vn_nav.co_visibility import overlap_by_poses, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess
-from vn_nav.overlap import overlap_by_poses, relative_pose
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.houses.house import CELL, DistanceField, FloorMap, Goal
 from vn_sim_bridge.recorded.pose_lattice import PoseMap, in_sight

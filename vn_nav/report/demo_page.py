@@ -10,9 +10,9 @@ import numpy as np
 
 from vn_nav import __version__
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
-from vn_nav.evaluation.maps import Journey, floor_map
 from vn_nav.evaluation.metrics import Episode, path_efficiency
-from vn_nav.evaluation.page import cards, page, picture, table
+from vn_nav.report.maps import Journey, floor_map
+from vn_nav.report.page import cards, page, picture, table
 
 STRIP = 9  # pictures of a film strip
 TITLES = {'trained': 'The house it was trained in', 'unseen': 'A house it has never seen'}

@@ -6,8 +6,8 @@ import html
 from collections.abc import Callable, Sequence
 
 from vn_nav.evaluation.evaluator import DECLARED
-from vn_nav.evaluation.page import table
-from vn_nav.evaluation.terminal import print_table
+from vn_nav.report.page import table
+from vn_nav.report.terminal import print_table
 
 TITLES = {'arrival': 'Arrival', 'declared': 'Declared stop'}
 SPLITS = {  # names of splits, for people

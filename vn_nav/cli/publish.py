@@ -8,7 +8,13 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from vn_nav.cli_world import (
+from vn_nav.cli.evaluate import (
+    DRIVE_SPLITS,
+    SPLIT_HOUSES,
+    check_evaluate_options,
+    evaluate,
+)
+from vn_nav.cli.world import (
     check_backend,
     check_world,
     load_for,
@@ -17,12 +23,6 @@ from vn_nav.cli_world import (
     make_env,
 )
 from vn_nav.errors import UserError
-from vn_nav.evaluation.command import (
-    DRIVE_SPLITS,
-    SPLIT_HOUSES,
-    check_evaluate_options,
-    evaluate,
-)
 
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
@@ -153,8 +153,9 @@ def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[di
 
 def run_publish(args) -> int:
     """`vn_nav publish`."""
-    from vn_nav.evaluation import evaluator, tables
+    from vn_nav.evaluation import evaluator
     from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
+    from vn_nav.report import tables
     checkpoint, _ = load_for_house(args.source, args.robot)
     info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
     save_checkpoint(args.target, checkpoint.network, info, half=True)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from vn_nav.evaluation.page import COLOURS, LIGHT
+from vn_nav.report.page import COLOURS, LIGHT
 
 DASH = 6.0, 4.0  # pixels drawn and left out
 FONT = 'system-ui, sans-serif'

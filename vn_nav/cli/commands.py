@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 
 from vn_nav import __version__
-from vn_nav.bags.command import add_bag_commands
-from vn_nav.cli_world import add_world, check_backend, load_for_house, machine, make_env
+from vn_nav.cli.bag import add_bag_commands
+from vn_nav.cli.world import add_world, check_backend, load_for_house, machine, make_env
 from vn_nav.errors import UserError
 
 
@@ -38,7 +38,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
     train = commands.add_parser('train', help='train a policy')
     if command in (None, 'train'):
-        from vn_nav.learning.command import add_train_options
+        from vn_nav.cli.train import add_train_options
         add_world(train)
         add_train_options(train)
     train.set_defaults(run=run_train)
@@ -56,21 +56,21 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
     pretrained = commands.add_parser('pretrain', help='pre-train a policy on recorded bags')
     if command in (None, 'pretrain'):
-        from vn_nav.learning.pretrain_command import add_pretrain_options, run_pretrain
+        from vn_nav.cli.pretrain import add_pretrain_options, run_pretrain
         add_pretrain_options(pretrained)
         pretrained.set_defaults(run=run_pretrain)
 
     taught = commands.add_parser(
         'teach', help='learn the place where a bag was driven, in its pictures')
     if command in (None, 'teach'):
-        from vn_nav.learning.teach import add_teach_options
+        from vn_nav.cli.teach import add_teach_options
         add_teach_options(taught)
     taught.set_defaults(run=run_teach)
 
     measured = commands.add_parser('evaluate', help='measure a checkpoint')
     if command in (None, 'evaluate'):
-        from vn_nav.cli_evaluate import run_evaluate
-        from vn_nav.evaluation.command import add_evaluate_options
+        from vn_nav.cli.evaluate import add_evaluate_options
+        from vn_nav.cli.publish import run_evaluate
         measured.add_argument('checkpoint', type=Path)
         add_world(measured, defaults=False)
         add_evaluate_options(measured)
@@ -78,7 +78,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
     compare = commands.add_parser('compare', help="plot several runs' learning curves")
     if command in (None, 'compare'):
-        from vn_nav.evaluation.command import add_compare_options, run_compare
+        from vn_nav.cli.evaluate import add_compare_options, run_compare
         add_compare_options(compare)
         compare.set_defaults(run=run_compare)
 
@@ -145,7 +145,7 @@ def run_collect(args) -> int:
 
 def run_train(args) -> int:
     """`vn_nav train`."""
-    from vn_nav.learning.command import check_train_options, train_config, world_options
+    from vn_nav.cli.train import check_train_options, train_config, world_options
     check_backend(args.backend)
     check_train_options(args)
     if args.env == 'ros':
@@ -195,8 +195,8 @@ def _bag_mix(args, config, robot):
     if not args.bags:
         return None
     from vn_nav.bags.roles import Topics, load_topics
+    from vn_nav.cli.pretrain import load_bags
     from vn_nav.learning.bag_mix import BagMix
-    from vn_nav.learning.pretrain_command import load_bags
     drives, _ = load_bags(args.bags, robot, args.size,
                           load_topics(args.topics) if args.topics else Topics(),
                           args.cache or args.out / 'decoded')
@@ -211,7 +211,7 @@ def _train_over_ros(args) -> int:
     """`vn_nav train --env ros`."""
     import torch
 
-    from vn_nav.learning.command import config_over_ros, train_config, world_options
+    from vn_nav.cli.train import config_over_ros, train_config, world_options
     from vn_nav.learning.trainer import train
     from vn_nav.robot import RobotSpec, load_robot
     try:
@@ -263,7 +263,7 @@ def _pair_sources(args, config):
 
 def run_teach(args) -> int:
     """`vn_nav teach`."""
-    from vn_nav.learning.teach import teach
+    from vn_nav.cli.teach import teach
     from vn_sim_bridge import teach_place as place
     return teach(args, place)
 
@@ -279,13 +279,13 @@ def run_export(args) -> int:
 
 def run_publish(args) -> int:
     """`vn_nav publish`."""
-    from vn_nav import cli_evaluate
-    return cli_evaluate.run_publish(args)
+    from vn_nav.cli import publish
+    return publish.run_publish(args)
 
 
 def run_demo(args) -> int:
     """`vn_nav demo`."""
-    from vn_nav.demo import run
+    from vn_nav.cli.demo import run
     from vn_nav.resources import share_file
     folder = args.checkpoint or share_file('models/house')
     task = load_for_house(folder)[0].info['task']  # refuse before anything is written
@@ -344,7 +344,3 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -11,11 +11,11 @@ import cv2
 
 from vn_nav import __version__
 from vn_nav.errors import UserError
-from vn_nav.evaluation.chart import Series, Shape, legend, panel, to_picture, to_svg
-from vn_nav.evaluation.curves import THRESHOLDS, Run, average, grouped, read_runs, summary
-from vn_nav.evaluation.page import CURVES, page, table
-from vn_nav.evaluation.terminal import print_table
 from vn_nav.files import write_file
+from vn_nav.report.chart import Series, Shape, legend, panel, to_picture, to_svg
+from vn_nav.report.curves import THRESHOLDS, Run, average, grouped, read_runs, summary
+from vn_nav.report.page import CURVES, page, table
+from vn_nav.report.terminal import print_table
 
 WIDTH, PLOT = 1040, 330  # pixels: of the chart, and the height of its panels
 PANELS = ((56.0, 500.0), (580.0, 1024.0))  # left and right

@@ -16,8 +16,8 @@ from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
 from vn_nav.bags.drive import RECORDED
 from vn_nav.bags.recorded_place import scene_of
 from vn_nav.bags.roles import Topics, load_topics
+from vn_nav.cli.train import CHANGES, train_config
 from vn_nav.errors import UserError
-from vn_nav.learning.command import CHANGES, train_config
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split
 from vn_nav.learning.presets import PRESETS, TrainConfig
 from vn_nav.learning.pretrain import PretrainConfig, choose_parts, pretrain

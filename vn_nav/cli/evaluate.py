@@ -116,9 +116,10 @@ def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) 
         splits: seeds of the houses by the split's name.
         measure: (split, houses) -> episodes as of `evaluator.measure`, floor plans by seed.
     """
-    from vn_nav.evaluation import evaluator, tables
-    from vn_nav.evaluation.evaluation_page import evaluation_page
+    from vn_nav.evaluation import evaluator
     from vn_nav.files import write_file
+    from vn_nav.report import tables
+    from vn_nav.report.evaluation_page import evaluation_page
     result = {
         'checkpoint': str(args.checkpoint), 'sha256': info['sha256'],
         'bag': args.bag.name if args.bag else None,
@@ -145,7 +146,7 @@ def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) 
 
 def run_compare(args) -> int:
     """`vn_nav compare`."""
-    from vn_nav.evaluation.compare import compare
+    from vn_nav.report.compare import compare
     _check_folders(args.out, args.json)
     compare(args.runs, args.out, metric=args.metric, labels=args.labels, band=args.band,
             log=args.log, json_file=args.json)

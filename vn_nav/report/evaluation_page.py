@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 from vn_nav import __version__
 from vn_nav.evaluation.evaluator import ARRIVAL, BLANK, DECLARED, RANDOM, WRONG, Rows
-from vn_nav.evaluation.maps import Journey, floor_map
 from vn_nav.evaluation.metrics import Episode
-from vn_nav.evaluation.page import cards, page
-from vn_nav.evaluation.tables import SPLITS, TITLES, rows_html, scenes_html
+from vn_nav.report.maps import Journey, floor_map
+from vn_nav.report.page import cards, page
+from vn_nav.report.tables import SPLITS, TITLES, rows_html, scenes_html
 
 MAPS = 6  # of a split, unless the user asks for another number
 WORDS = """<h2>What the words mean</h2><dl>
