@@ -1,4 +1,4 @@
-"""How far odometry goes astray over a long drive, and how far `vn_nav.bags.loops` brings it back.
+"""How far odometry drifts over a long drive, and what `mapping.loop_closure` makes of it.
 
     python bench/loops.py --houses 12000 12001 --minutes 10 --size 128 --drift 1
 
@@ -23,7 +23,7 @@ import numpy as np
 from common import pin
 
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.loops import between, straighten
+from vn_nav.bags.mapping.loop_closure import between, straighten
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.houses.house import CELL, House

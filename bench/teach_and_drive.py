@@ -41,7 +41,7 @@ import yaml
 from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.motion import fill_twist, odometry_to_array
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS, arrived, wrap_angle
-from vn_nav.bags.reader import read_bag
+from vn_nav.bags.storage.reader import read_bag
 from vn_nav.cli.demo import LINE
 from vn_nav.cli.world import machine
 from vn_nav.errors import UserError

@@ -7,10 +7,10 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.doctor import diagnose
-from vn_nav.bags.recorder import BagWriter
+from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.roles import Topics
-from vn_nav.bags.stream import messages, summary
+from vn_nav.bags.storage.stream import messages, summary
+from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec

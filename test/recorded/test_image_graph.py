@@ -5,10 +5,11 @@ import math
 
 import numpy as np
 import pytest
+from corridor_drive import ROBOT, SIZE, corridor_graph, graph_of, line, show, spin
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
-from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.robot import RobotSpec
 from vn_sim_bridge.datasets.recorded_pairs import GraphPairs
 from vn_sim_bridge.houses.house import CELL
 from vn_sim_bridge.houses.procedural import generate_house
@@ -19,43 +20,12 @@ from vn_sim_bridge.simulators.house import HouseBackend
 from vn_sim_bridge.simulators.recorded import ImageGraphBackend, turned
 from vn_sim_bridge.teach_place import held_out, make_env, make_pairs
 
-ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
-SIZE = 16
 SLACK = CELL + HEADING
-
-
-def line(length, yaw=0.0, x=0.0, y=0.0, every=0.1):
-    """Poses along a straight way."""
-    along = np.arange(0, length + 1e-9, every)
-    return np.column_stack([x + along * math.cos(yaw), y + along * math.sin(yaw),
-                            np.full(len(along), yaw)])
-
-
-def spin(x, y, yaw=0.0):
-    """Poses of a turn on the spot."""
-    return np.array([[x, y, wrap_angle(yaw + math.radians(a))] for a in range(0, 360, 10)])
-
-
-def show(poses):
-    """A picture of each pose, unlike any other."""
-    return np.stack([np.random.default_rng(k).integers(0, 256, (3, SIZE, SIZE), np.uint8)
-                     for k in range(len(poses))])
-
-
-def graph_of(*parts, episode=None, **options):
-    """A graph of some pieces of a drive, one episode if nothing else is said."""
-    poses = np.concatenate(parts)
-    episode = np.zeros(len(poses), int) if episode is None else episode
-    return build_graph(show(poses), poses, episode, ROBOT, world_version='recorded', **options)
 
 
 @pytest.fixture(scope='module')
 def corridor():
-    """Forth and back through a corridor of 4 m, with a turn on the spot at each metre."""
-    parts = []
-    for x in range(4):
-        parts += [spin(x, 0), line(1, x=x)]
-    return graph_of(*parts, spin(4, 0), line(4, math.pi, x=4), goals=12)
+    return corridor_graph()
 
 
 def backend(graph, *poses, **options):

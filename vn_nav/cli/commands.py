@@ -121,7 +121,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 def run_collect(args) -> int:
     """`vn_nav collect`."""
     check_backend(args.backend)
-    from vn_nav.bags.recorder import BagWriter
+    from vn_nav.bags.storage.writer import BagWriter
     from vn_nav.robot import RobotSpec, load_robot
     from vn_sim_bridge.datasets.collect import collect, house_scenes
     from vn_sim_bridge.houses.splits import SPLITS

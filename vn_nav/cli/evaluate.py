@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from vn_nav.bags.recorded_place import (
+from vn_nav.bags.mapping.recorded_place import (
     add_place_options,
     check_place_options,
     given_place_options,

@@ -14,7 +14,7 @@ import torch
 
 from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
 from vn_nav.bags.drive import RECORDED
-from vn_nav.bags.recorded_place import scene_of
+from vn_nav.bags.mapping.recorded_place import scene_of
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.cli.train import CHANGES, train_config
 from vn_nav.errors import UserError

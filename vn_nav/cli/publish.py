@@ -121,7 +121,7 @@ def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
 
 def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[dict, Callable]:
     """The goals of each split in a recorded drive, and what measures there."""
-    from vn_nav.bags.recorded_place import read_place
+    from vn_nav.bags.mapping.recorded_place import read_place
     from vn_nav.evaluation import evaluator
     from vn_sim_bridge import teach_place as place
     info = checkpoint.info

@@ -11,7 +11,7 @@ import functools
 import math
 from pathlib import Path
 
-from vn_nav.bags.recorded_place import add_place_options, check_place_options, read_place
+from vn_nav.bags.mapping.recorded_place import add_place_options, check_place_options, read_place
 from vn_nav.cli.train import CHANGES, train_config
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig

@@ -54,7 +54,7 @@ class Scene(Protocol):
 
 
 class Writer(Protocol):
-    """A bag being written, as `vn_nav.bags.recorder.BagWriter`; a context manager."""
+    """A bag being written, as `vn_nav.bags.storage.writer.BagWriter`; a context manager."""
 
     def write(self, name: str, data: bytes, stamp: int) -> None:
         """Append a message; the stamp is in ns since 1970."""
