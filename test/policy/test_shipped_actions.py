@@ -1,8 +1,8 @@
 """The shipped models act on seeded episodes as they did when they were shipped, bit for bit.
 
 `shipped_actions.json` was recorded before the memory of blocked actions became the filter of
-`vn_nav.policy.action_filter`. Record it anew (`python test/policy/test_shipped_actions.py`) only where
-pixels, motion, weights or the filter's rule change on purpose.
+`vn_nav.policy.action_filter`. Record it anew (`python test/policy/test_shipped_actions.py`) only
+where pixels, motion, weights or the filter's rule change on purpose.
 """
 
 from __future__ import annotations
