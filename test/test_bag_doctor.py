@@ -331,4 +331,5 @@ def test_a_topic_of_another_type_is_one_error_in_every_command(
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert f'the {role} of a bag is' in line and f'{topic}: {kind}' in line
     found = diagnose(bag, topics=load_topics(names))
-    assert any(f.topic == topic and f'is {kind}, not' in f.what for f in found.findings)
+    (finding,) = (f for f in found.findings if f.topic == topic and f'is {kind}, not' in f.what)
+    assert f'{role}: null' in finding.remedy  # the other of odometry and commands is there

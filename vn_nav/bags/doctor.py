@@ -26,7 +26,7 @@ from vn_nav.bags.doctor_figures import (
     Motion,
     Neighbours,
 )
-from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy
+from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy, replaced
 from vn_nav.bags.stamped import GAP, WINDOW
 from vn_nav.bags.stream import UNLISTED, Bag, BagError, Connection, Message
 from vn_nav.errors import UserError
@@ -274,11 +274,13 @@ class _Doctor:
     def _missing(self, roles: dict[str, list[HeardTopic]]) -> None:
         free = {t.connection.topic: t.connection.type for t in self.topics.values()
                 if t.role is None}
+        kinds = {role: same[0].connection.type for role, same in roles.items() if same}
         for topic in (t for same in roles.values() for t in same):
             if not fits(topic.role, topic.connection.type):
                 self.find(ERROR, topic.connection.topic, 'type', 'is '
                           f'{topic.connection.type or "of no type"}, not '
-                          f'{" or ".join(TYPES[topic.role])}', None, remedy(topic.role, free))
+                          f'{" or ".join(TYPES[topic.role])}', None,
+                          remedy(topic.role, free, replaced(topic.role, kinds)))
 
         def candidates(role: str) -> str:
             return proposal(role, free) or 'record it'
