@@ -388,4 +388,4 @@ def diagnose(path: str | Path, *, topics: Topics | None = None, fov: float | Non
     findings = doctor.conclude(bag)
     seconds = 0.0 if doctor.start is None else (doctor.end - doctor.start) * 1e-9
     figures = sorted((topic.figures() for topic in doctor.topics.values()), key=lambda t: t.topic)
-    return Diagnosis(str(path), seconds, figures, findings)
+    return Diagnosis(str(path), seconds, figures, findings, bag.notes)
