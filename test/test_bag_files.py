@@ -209,6 +209,10 @@ def test_a_recording_is_known_by_its_first_bytes(tmp_path):
     folder = splits(tmp_path / 'bag')
     (folder / 'r_2.mcap').rename(folder / 'r_2.uploading')
     refusal(folder, 'r_2.uploading: an MCAP file by its first bytes.*rename it')
+    listed = folder / 'metadata.yaml'
+    listed.write_text(METADATA % ('r_0.mcap, r_1.mcap, r_2.uploading', ''))
+    assert len(list(messages(folder))) == len(SENT)  # it is a name that somebody gave it
+    listed.unlink()
     (folder / 'r_2.uploading').rename(folder / 'third')
     refusal(folder, 'third: an MCAP file by its first bytes')
     ros1(folder / 'x.bag').rename(folder / 'third')
@@ -322,6 +326,10 @@ def test_what_sqlite_has_not_yet_put_into_its_file_is_converted_too(tmp_path):
         (before,) = base.execute('SELECT count(*) FROM messages').fetchone()
     assert before == len(SENT)  # as the converter reads it
     command = re.search('`(.*)`', refusal(folder, 'a bag is a folder').remedy).group(1)
+    assert 'wal_checkpoint' in refusal(path, 'a bag in SQLite').remedy
+    (folder / 'metadata.yaml').rename(tmp_path / 'metadata.yaml')
+    assert 'wal_checkpoint' in refusal(folder, 'a bag in SQLite').remedy
+    (tmp_path / 'metadata.yaml').rename(folder / 'metadata.yaml')
     if shutil.which('sqlite3') is None:
         pytest.skip('expected: sqlite3 is not installed')
     program = Path(sys.executable).with_name('rosbags-convert')

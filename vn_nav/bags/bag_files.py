@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+from collections.abc import Container
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,7 +112,7 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
             raise
         return BagFiles(there, [Loss(error.path, 0, 0, error.fault, harmless=True),
                                 *_unreadable(path, there, faults, rest, strict)])
-    _refuse_other_formats(path, names)
+    _refuse_other_formats(path, names, listed=[file.name for file in listed])
     gone = [file for file in listed if file not in faults and not file.is_file()]
     more = [file for file in there if file not in listed]
     if gone and (strict or len(gone) == len(listed) and not more):
@@ -209,7 +210,7 @@ def _listed(folder: Path, names: list[str]) -> tuple[dict, list[Path]]:
         raise OtherFormat(path, f'its storage is {storage!r}', anew)
     listed = [found.name if (found := recording(name)) and found.name in names else name
               for name in listed]
-    _refuse_other_formats(folder, listed)
+    _refuse_other_formats(folder, listed, listed=listed)
     return information, [folder / name for name in listed]
 
 
@@ -222,7 +223,8 @@ def _origin(information: dict) -> tuple[str | None, dict[str, str] | None]:
             {str(key): str(value) for key, value in data.items()} if whole and data else None)
 
 
-def _refuse_other_formats(folder: Path, names: list[str], alone: bool = False) -> None:
+def _refuse_other_formats(folder: Path, names: list[str], alone: bool = False,
+                          listed: Container[str] = ()) -> None:
     """Refuse recordings that are not read as they are, with the command that makes them readable.
 
     Args:
@@ -230,10 +232,12 @@ def _refuse_other_formats(folder: Path, names: list[str], alone: bool = False) -
         names: of the files.
         alone: it is one file that was asked for, and not its folder: if it begins as an MCAP file
             it is read, though it may not be finished.
+        listed: names that metadata.yaml has, whatever they are.
     """
     for name in names:
         path, found = folder / name, recording(name)
-        if found and found.kind == '.mcap' and not found.more or has_twin(name, names):
+        if (found and found.kind == '.mcap' and not found.more or has_twin(name, names)
+                or found is None and name in listed):
             continue
         fault = _fault(path) if found and os.path.lexists(path) else None
         if fault is not None and fault[0] != EMPTY:

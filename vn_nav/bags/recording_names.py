@@ -95,6 +95,8 @@ def conversion(path: Path, found: Recording, names: Iterable[str], alone: bool) 
     if found.more:
         return f'{what} under another name', (
             f'rename it to {shlex.quote(found.name)}, or move it elsewhere')
+    if alone and path.with_name(f'{path.name}-wal').exists():
+        names = [*names, f'{path.name}-wal']
     source = path if alone else path.with_name(f'*{path.suffix}')
     return what, f'write it anew with {converted(source, names)}'
 
