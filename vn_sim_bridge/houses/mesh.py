@@ -73,10 +73,18 @@ def load_mesh(path: str | Path, *, labels: dict[str, str] | None = None,
     except Exception as error:
         # Whatever a reader trips over is a broken file, not a reason for a traceback.
         raise UserError('a mesh file is whole and follows its format',
-                        f'{path}: {type(error).__name__}: {error}', 'export it again') from error
+                        f'{path}: {_words(error)}', 'export it again') from error
     if not parts:
         raise UserError('a mesh file has triangles', str(path), 'export the geometry, too')
     return _scene(parts, class_ids, path, up or 'y', scale, double_sided)
+
+
+def _words(error: Exception) -> str:
+    """What a reader tripped over, without the names of Python's exceptions."""
+    if isinstance(error, KeyError):
+        return f'{error} is missing'
+    return str(error) if isinstance(error, ValueError) else (
+        f'a value is not what the format has there ({error})')
 
 
 def _within(parts, path: Path, double_sided: bool | None) -> list[Part]:

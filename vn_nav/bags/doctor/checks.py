@@ -14,7 +14,7 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
-from vn_nav.bags.doctor.figures import (
+from vn_nav.bags.doctor.checks.figures import (
     BACK,
     ERROR,
     WARNING,
@@ -25,7 +25,7 @@ from vn_nav.bags.doctor.figures import (
     Motion,
     Neighbours,
 )
-from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy
+from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy, replaced
 from vn_nav.bags.stamped import GAP, WINDOW
 from vn_nav.bags.storage.decoding import Decoder, Ros1
 from vn_nav.bags.storage.stream import UNLISTED, Bag, BagError, Connection, Message
@@ -274,11 +274,13 @@ class _Doctor:
     def _missing(self, roles: dict[str, list[HeardTopic]]) -> None:
         free = {t.connection.topic: t.connection.type for t in self.topics.values()
                 if t.role is None}
+        kinds = {role: same[0].connection.type for role, same in roles.items() if same}
         for topic in (t for same in roles.values() for t in same):
             if not fits(topic.role, topic.connection.type):
                 self.find(ERROR, topic.connection.topic, 'type', 'is '
                           f'{topic.connection.type or "of no type"}, not '
-                          f'{" or ".join(TYPES[topic.role])}', None, remedy(topic.role, free))
+                          f'{" or ".join(TYPES[topic.role])}', None,
+                          remedy(topic.role, free, replaced(topic.role, kinds)))
 
         def candidates(role: str) -> str:
             return proposal(role, free) or 'record it'
@@ -386,4 +388,4 @@ def diagnose(path: str | Path, *, topics: Topics | None = None, fov: float | Non
     findings = doctor.conclude(bag)
     seconds = 0.0 if doctor.start is None else (doctor.end - doctor.start) * 1e-9
     figures = sorted((topic.figures() for topic in doctor.topics.values()), key=lambda t: t.topic)
-    return Diagnosis(str(path), seconds, figures, findings)
+    return Diagnosis(str(path), seconds, figures, findings, bag.notes)

@@ -78,6 +78,7 @@ class Diagnosis:
     seconds: float
     topics: list[TopicFigures]
     findings: list[Finding]
+    notes: list[str]  # what is no fault and worth knowing, see `Bag.notes`
 
     @property
     def usable(self) -> bool:
