@@ -37,6 +37,8 @@ class PlaceRecogniser(nn.Module):
         spots: [K,2] m, where they lie in the frame of the place.
     """
 
+    spots: Tensor
+
     def __init__(self, size: int, spots: int, mean: float, std: float):
         super().__init__()
         self.width = spots + HEADINGS
@@ -99,6 +101,8 @@ class LookAround(nn.Module):
     Attributes:
         width: K + 1 numbers to remember: the sum of the probabilities, and of how many pictures.
     """
+
+    stays: Tensor
 
     def __init__(self, moves: Sequence[Sequence[float]], spots: int):
         super().__init__()
