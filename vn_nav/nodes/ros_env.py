@@ -206,8 +206,9 @@ class RosEnv:
                 self._tell(seen, reset, success, collided, arrived))
 
     def _begin(self, k: int) -> Seen:
-        seen = self._robots[k].begin()
-        self._goal_index[k] = self._number(self._robots[k].goal)
+        seen, goal = self._robots[k].begin(), self._robots[k].goal
+        assert goal is not None  # no episode begins without
+        self._goal_index[k] = self._number(goal)
         self._last_action[k], self._last_reward[k] = -1, 0.0
         return seen
 

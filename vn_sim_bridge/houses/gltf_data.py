@@ -176,6 +176,7 @@ class GltfData:
         """An image, [H,W,3] uint8."""
         if index not in self._pictures:
             entry = self.get('images', index)
+            data: bytes | memoryview
             if 'uri' in entry:
                 name, data = self._uri(entry['uri'])
             else:

@@ -275,12 +275,12 @@ class _Doctor:
         free = {t.connection.topic: t.connection.type for t in self.topics.values()
                 if t.role is None}
         kinds = {role: same[0].connection.type for role, same in roles.items() if same}
-        for topic in (t for same in roles.values() for t in same):
-            if not fits(topic.role, topic.connection.type):
+        for role, topic in ((role, t) for role, same in roles.items() for t in same):
+            if not fits(role, topic.connection.type):
                 self.find(ERROR, topic.connection.topic, 'type', 'is '
                           f'{topic.connection.type or "of no type"}, not '
-                          f'{" or ".join(TYPES[topic.role])}', None,
-                          remedy(topic.role, free, replaced(topic.role, kinds)))
+                          f'{" or ".join(TYPES[role])}', None,
+                          remedy(role, free, replaced(role, kinds)))
 
         def candidates(role: str) -> str:
             return proposal(role, free) or 'record it'
@@ -335,16 +335,18 @@ class _Doctor:
 
     def _clocks(self, roles: dict[str, list[HeardTopic]], lags: dict[str, float]) -> None:
         """Stamps against the recorder's clock, and of one sensor against another's."""
-        for topic in (t for role in STAMPED for t in roles[role] if t.jump is not None):
+        for topic in (t for role in STAMPED for t in roles[role]):
+            if topic.jump is None:
+                continue
             jump, at = topic.jump
             self.find(ERROR, topic.connection.topic, 'jump', 'is stamped by a clock that jumps by '
                       f'{jump * 1e-9:.1f} s', at, 'synchronise the clocks (chrony) before '
                       'recording; split the bag here')
-        for topic, lag in lags.items():
+        for name, lag in lags.items():
             if abs(lag) > JUMP:
-                self.find(WARNING, topic, 'skew', f'is stamped {lag * 1e-9:.1f} s before it is '
+                self.find(WARNING, name, 'skew', f'is stamped {lag * 1e-9:.1f} s before it is '
                           'recorded', None, 'synchronise the clocks (chrony)')
-        late, early = max(lags, key=lags.get), min(lags, key=lags.get)
+        late, early = max(lags, key=lags.__getitem__), min(lags, key=lags.__getitem__)
         if lags[late] - lags[early] > SKEW:
             self.find(ERROR, late, 'skew to others', 'is stamped '
                       f'{(lags[late] - lags[early]) * 1e-9:.1f} s earlier than {early} at the '
