@@ -10,12 +10,11 @@ import pytest
 import torch
 from corridor_drive import ROBOT, SIZE, corridor_graph
 from torch.nn import functional as F
-from vn_nav.cli.teaching import _widened
-from vn_sim_bridge.teach_place_place import make_views, regrets
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import imitation_loss
 from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spots
+from vn_nav.learning.teaching import _widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.policy.places import HEADINGS, MultiViewAveraging
@@ -24,6 +23,7 @@ from vn_sim_bridge.datasets.recorded_views import GraphViews
 from vn_sim_bridge.recorded.pose_lattice import MOST
 from vn_sim_bridge.recorded.relight import draw_light, relight
 from vn_sim_bridge.simulators.recorded import ImageGraphBackend
+from vn_sim_bridge.teach_place import make_views, regrets
 
 SIDE = 36
 CONFIG = NetworkConfig(actions=ROBOT.action_names, size=SIDE, channels=(8, 8, 8), features=16,

@@ -1,7 +1,7 @@
 """`vn_nav teach`: a policy for the place where a bag was driven, learned in the bag's pictures.
 
 The simulator's half, which makes a place out of pictures with poses, comes from the caller
-(`vn_sim_bridge.teach_place_place`).
+(`vn_sim_bridge.teach_place`).
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import math
 from pathlib import Path
 
 from vn_nav.bags.mapping.recorded_place import add_place_options, check_place_options, read_place
-from vn_nav.cli.teaching import PRESET, SEARCHED, Place, Teaching
 from vn_nav.cli.train import CHANGES, train_config
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
+from vn_nav.learning.teaching import PRESET, SEARCHED, Place, Teaching
 from vn_nav.learning.trainer import STATE
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint

@@ -1,7 +1,7 @@
 """What `vn_nav teach` does with a place: divides its minutes, learns, measures, keeps.
 
 The simulator's half, which makes a place out of pictures with poses, comes from the caller
-(`vn_sim_bridge.teach_place_place`).
+(`vn_sim_bridge.teach_place`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ COLLISION_REWARD = -0.05  # of leaving what the pictures cover
 
 
 class Place(Protocol):
-    """What the simulator's half makes of a drive; `vn_sim_bridge.teach_place_place` is one."""
+    """What the simulator's half makes of a drive; `vn_sim_bridge.teach_place` is one."""
 
     def build_graph(self, pictures, poses, episode, robot: RobotSpec, **options) -> Any:
         """A place out of pictures with poses."""
