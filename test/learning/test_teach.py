@@ -25,7 +25,7 @@ from small_bags import (
     picture,
     serialised,
 )
-from vn_nav.cli.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
 
 from vn_msgs_py.topics import topic
 from vn_nav.bags.mapping.pose_graph import between, compose

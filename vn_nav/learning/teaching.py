@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from vn_nav.cli.evaluate import DRIVE_SPLITS
-from vn_nav.cli.teach_evaluation import LEAST, Evaluation, Plan, cost_of, plan, rows_of
+from vn_nav.learning.teach_evaluation import LEAST, Evaluation, Plan, cost_of, plan, rows_of
 from vn_nav.evaluation import evaluator
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BANK, BATCH, Views, fit_places, fit_routes
