@@ -25,7 +25,6 @@ from small_bags import (
     picture,
     serialised,
 )
-from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
 
 from vn_msgs_py.topics import topic
 from vn_nav.bags.mapping.pose_graph import between, compose
@@ -35,6 +34,7 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.presets import preset
 from vn_nav.learning.stages import Stages
+from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
 from vn_nav.learning.teaching import OWN
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 
 from vn_nav.cli.evaluate import DRIVE_SPLITS
-from vn_nav.learning.teach_evaluation import LEAST, Evaluation, Plan, cost_of, plan, rows_of
 from vn_nav.evaluation import evaluator
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BANK, BATCH, Views, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
+from vn_nav.learning.teach_evaluation import LEAST, Evaluation, Plan, cost_of, plan, rows_of
 from vn_nav.learning.trainer import CHECKPOINT, STATE, has_fast_bfloat16, train
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
