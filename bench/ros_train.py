@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 from common import pin, report
 
-from vn_nav.cli.train import config_over_ros
 from vn_nav.learning.distributed import Processes
+from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, preset
 from vn_nav.learning.trainer import Training
 from vn_nav.resources import share_file

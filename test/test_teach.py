@@ -35,10 +35,13 @@ from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.presets import preset
 from vn_nav.learning.stages import Stages
 from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
-from vn_nav.learning.teaching import OWN
+from vn_nav.learning.teach_job import TeachJob
+from vn_nav.learning.teach_network import OWN
+from vn_nav.learning.teaching import teach
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_sim_bridge import teach as place
 from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.image_graph import build_graph
@@ -387,5 +390,4 @@ def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, caps
 
 def raise_of(bag, out):
     """Teach again where something was taught already."""
-    from vn_nav.cli import build_parser, run_teach
-    run_teach(build_parser().parse_args(['teach', str(bag), '--out', str(out)]))
+    teach(TeachJob(bag, out), place)

@@ -202,7 +202,7 @@ ENVIRONMENT: dict[str, dict] = {
 }
 
 
-def preset(name: str, **changes) -> TrainConfig:
+def preset(name: str, /, **changes) -> TrainConfig:
     """The configuration of a preset with some numbers changed.
 
     Raises:
