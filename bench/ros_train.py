@@ -29,7 +29,7 @@ from vn_nav.learning.presets import ENVIRONMENT, preset
 from vn_nav.learning.trainer import Training
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 HOUSE, ROOMS = 7, 5
 BASE = share_file('config/robots/demo_base.yaml')

@@ -6,11 +6,10 @@ import importlib.util
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from paths import ROOT, TESTS
 
-ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 # The leaves that the simulator may use, and what its node shares with the other nodes.
 LEAVES = {'vn_nav.arrival', 'vn_nav.errors', 'vn_nav.goal_picture', 'vn_nav.observation',
@@ -117,7 +116,7 @@ def test_the_rest_imports_without_ros(tmp_path):
     names = [name_of(path) for path in SOURCES if not at_the_edge(path)]
     if importlib.util.find_spec('warp') is None:  # an extra: make test-all has it
         names = [name for name in names if '.warp_' not in name]
-    code = BLOCK.format(tests=str(Path(__file__).parent), names=names)
+    code = BLOCK.format(tests=str(TESTS), names=names)
     result = subprocess.run(
         [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True,
         env={**os.environ, 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'})

@@ -74,7 +74,7 @@ def _add_drive(parser: argparse.ArgumentParser) -> None:
 
 def run_doctor(args) -> int:
     """`vn_nav bag doctor`: 0 where the bag can be used, 1 where it cannot."""
-    from vn_nav.bags.doctor import diagnose
+    from vn_nav.bags.doctor.checks import diagnose
     from vn_nav.bags.roles import load_topics
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise UserError('a file is written into a folder that exists', str(args.json),
@@ -94,7 +94,7 @@ def run_doctor(args) -> int:
 
 def run_recover(args) -> int:
     """`vn_nav bag recover`: 0, with what was lost told; if strict, 2 where something was."""
-    from vn_nav.bags.recover import recover
+    from vn_nav.bags.doctor.checks.recover import recover
     recovered = recover(args.bag, args.out)
     print('\n'.join(recovered.lines()))
     return 2 if args.strict and recovered.lost else 0
@@ -102,8 +102,8 @@ def run_recover(args) -> int:
 
 def run_show(args) -> int:
     """`vn_nav bag show`."""
-    from vn_nav.bags.show import show
-    from vn_nav.bags.show_page import show_page
+    from vn_nav.bags.report.page import show_page
+    from vn_nav.bags.report.show import show
     from vn_nav.files import write_file
     from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
     if not args.out.absolute().parent.is_dir():
@@ -129,7 +129,7 @@ def run_show(args) -> int:
 
 def run_export(args) -> int:
     """`vn_nav bag export`."""
-    from vn_nav.bags.lerobot import export
+    from vn_nav.bags.export.lerobot import export
     from vn_nav.robot import RobotSpec, load_robot
     robot = load_robot(args.robot) if args.robot else RobotSpec()
     print(export(args.bag, args.lerobot, topics=_topics(args.topics), robot=robot.name,

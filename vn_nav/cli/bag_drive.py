@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vn_nav.bags.compare_drives import (
+from vn_nav.bags.roles import Topics
+from vn_nav.bags.shadow.compare import (
     ARRIVED,
     as_json,
     compare,
@@ -17,8 +18,7 @@ from vn_nav.bags.compare_drives import (
     markdown,
     read_shadow,
 )
-from vn_nav.bags.roles import Topics
-from vn_nav.bags.shadow_plan import Plan, make_plan
+from vn_nav.bags.shadow.plan import Plan, make_plan
 from vn_nav.errors import UserError
 from vn_nav.files import write_file
 from vn_nav.goal_picture import read_goal_picture

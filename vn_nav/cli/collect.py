@@ -24,11 +24,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """`vn_nav collect`."""
     check_backend(args.backend)
-    from vn_nav.bags.recorder import BagWriter
+    from vn_nav.bags.storage.writer import BagWriter
     from vn_nav.robot import RobotSpec, load_robot
-    from vn_sim_bridge.collect import collect, house_scenes
+    from vn_sim_bridge.datasets.collect import collect, house_scenes
     from vn_sim_bridge.houses.splits import SPLITS
-    from vn_sim_bridge.randomisation import load_randomisation
+    from vn_sim_bridge.render.randomisation import load_randomisation
     if args.house and args.houses:
         raise UserError('pictures are of named houses or of the first N', '--house and --houses',
                         'give one of them')

@@ -157,7 +157,7 @@ def _splits(args: argparse.Namespace, info: dict) -> dict[str, list[int]]:
 
 def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
     """The houses of each split, and what makes environments of them."""
-    from vn_sim_bridge.world import WORLD_VERSION
+    from vn_sim_bridge.floor.contacts import WORLD_VERSION
     check_world(checkpoint.info, WORLD_VERSION)
     rooms = args.rooms or checkpoint.info['rooms']
     if rooms is None:
@@ -176,8 +176,8 @@ def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
 
 def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[dict, Callable]:
     """The goals of each split in a recorded drive, and what makes environments there."""
-    from vn_nav.bags.recorded_place import read_place
-    from vn_sim_bridge import teach as place
+    from vn_nav.bags.mapping.recorded_place import read_place
+    from vn_sim_bridge import teach_place as place
     graph = read_place(args.bag, place_options(args), place.build_graph, robot,
                        checkpoint.config.size, cache)
     check_world(checkpoint.info, graph.world_version)

@@ -27,9 +27,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _show(args: argparse.Namespace) -> int:
     """`vn_nav house show`."""
-    from vn_sim_bridge.houses.contact_sheet import write_contact_sheet
     from vn_sim_bridge.houses.procedural import generate_house
-    from vn_sim_bridge.randomisation import load_randomisation
+    from vn_sim_bridge.render.randomisation import load_randomisation
+    from vn_sim_bridge.tools.contact_sheet import write_contact_sheet
     house = generate_house(args.seed, rooms=args.rooms)
     path = args.out or Path(f'house-{args.seed}.png')
     write_contact_sheet(path, house, load_randomisation(args.randomisation))
@@ -42,8 +42,8 @@ def _show(args: argparse.Namespace) -> int:
 def _walk(args: argparse.Namespace) -> int:
     """`vn_nav house walk`."""
     from vn_sim_bridge.houses.procedural import generate_house
-    from vn_sim_bridge.houses.walk import walk
-    from vn_sim_bridge.randomisation import load_randomisation
+    from vn_sim_bridge.render.randomisation import load_randomisation
+    from vn_sim_bridge.tools.walk import walk
     walk(generate_house(args.seed, rooms=args.rooms), load_randomisation(args.randomisation))
     return 0
 

@@ -46,7 +46,7 @@ def place_options(args: argparse.Namespace):
     Raises:
         UserError: values that no drive is a place with.
     """
-    from vn_nav.bags.recorded_place import PlaceOptions
+    from vn_nav.bags.mapping.recorded_place import PlaceOptions
     from vn_nav.bags.roles import Topics, load_topics
     return PlaceOptions(topics=load_topics(args.topics) if args.topics else Topics(),
                         margin=args.margin, straighten=args.straighten,

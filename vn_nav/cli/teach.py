@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         UserError: options, a bag or a checkpoint that do not fit.
         KeyboardInterrupt: after SIGINT or SIGTERM, with what was learned and measured until then.
     """
-    from vn_sim_bridge import teach as place
+    from vn_sim_bridge import teach_place as place
     job = TeachJob(
         bag=args.bag, out=args.out, checkpoint=args.checkpoint, minutes=args.minutes,
         robot=load_robot(args.robot) if args.robot else RobotSpec(), options=place_options(args),

@@ -152,8 +152,8 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     if args.env == 'ros':
         return _over_ros(args)
-    from vn_sim_bridge.env import PRIVILEGED
     from vn_sim_bridge.houses.splits import SPLITS
+    from vn_sim_bridge.navigation.env import PRIVILEGED
     houses = args.house or list(SPLITS['train'][:args.houses or 1])
     config, world = train_config(args), world_options(args)
     env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
@@ -248,9 +248,9 @@ def _pair_sources(args: argparse.Namespace, config):
     """Makes the pairs that a training begins with, and those of validation houses."""
     def make():
         from vn_nav.robot import load_robot
+        from vn_sim_bridge.datasets.house_pairs import PairSampler
         from vn_sim_bridge.houses.splits import SPLITS
-        from vn_sim_bridge.pairs import PairSampler
-        from vn_sim_bridge.randomisation import load_randomisation
+        from vn_sim_bridge.render.randomisation import load_randomisation
         options = {'rooms': args.rooms, 'size': args.size, 'threads': config.threads,
                    'robot': load_robot(args.robot) if args.robot else None,
                    'randomisation': load_randomisation(args.randomisation)}

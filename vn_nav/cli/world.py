@@ -39,15 +39,15 @@ def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, thread
     On a device other than the CPU it is a `WarpNavigationEnv`.
     """
     from vn_nav.robot import load_robot
-    from vn_sim_bridge.env import EnvConfig, NavigationEnv
-    from vn_sim_bridge.randomisation import load_randomisation
+    from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+    from vn_sim_bridge.render.randomisation import load_randomisation
     config = EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs,
                        randomisation=load_randomisation(randomisation), **options)
     spec = load_robot(robot) if robot else None
     if device == 'cpu':
         return NavigationEnv(config, spec, threads=threads)
     _check_gpu(device)
-    from vn_sim_bridge.warp_env import WarpNavigationEnv
+    from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     return WarpNavigationEnv(config, spec, device=device)
 
 
@@ -126,7 +126,7 @@ def load_for(path: Path, robot: Path | None = None):
 
 def load_for_house(path: Path, robot: Path | None = None):
     """As `load_for`, of a policy that was trained in embedded houses of the present version."""
-    from vn_sim_bridge.world import WORLD_VERSION
+    from vn_sim_bridge.floor.contacts import WORLD_VERSION
     checkpoint, spec = load_for(path, robot)
     _check_version(checkpoint.info['world_version'], WORLD_VERSION)
     return checkpoint, spec

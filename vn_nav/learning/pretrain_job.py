@@ -15,7 +15,7 @@ import torch
 
 from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
 from vn_nav.bags.drive import RECORDED
-from vn_nav.bags.recorded_place import scene_of
+from vn_nav.bags.mapping.recorded_place import scene_of
 from vn_nav.bags.roles import Topics
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split

@@ -14,7 +14,7 @@ from vn_nav.robot import RobotSpec
 
 
 class Place(Protocol):
-    """What the simulator's half makes of a drive; `vn_sim_bridge.teach` is one."""
+    """What the simulator's half makes of a drive; `vn_sim_bridge.teach_place` is one."""
 
     def build_graph(self, pictures, poses, episode, robot: RobotSpec, **options) -> Any:
         """A place out of pictures with poses."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vn_nav.bags.recorded_place import PlaceOptions
+from vn_nav.bags.mapping.recorded_place import PlaceOptions
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig, preset
 from vn_nav.policy.checkpoint import LoadedCheckpoint

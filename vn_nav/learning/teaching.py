@@ -3,7 +3,7 @@
 It makes a place of the drive, divides its minutes, learns, measures and keeps.
 
 The simulator's half, which makes a place out of pictures with poses, comes from the caller
-(`vn_sim_bridge.teach`).
+(`vn_sim_bridge.teach_place`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from vn_nav.bags.recorded_place import read_place
+from vn_nav.bags.mapping.recorded_place import read_place
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.learning.pairs import PairSource
