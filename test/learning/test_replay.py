@@ -4,6 +4,7 @@ import colorsys
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
