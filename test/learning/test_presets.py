@@ -159,5 +159,11 @@ def test_values_of_every_kind_are_taken():
     assert (config.gamma, config.frames, config.clip, config.channels, config.track_goal,
             config.teacher) == (1.0, 2_000_000, None, (8, 16, 8), True, 'oracle')
     assert isinstance(config.gamma, float) and isinstance(config.frames, int)
+    assert train_config(parse('--set', 'seed=5', '--set', 'tensorboard=true')).seed == 5
     config = train_config(parse('--preset', 'icra2017', '--set', 'frozen_weights=2015'))
     assert config.frozen_weights == '2015'  # a file's name, whatever it looks like
+
+
+def test_a_number_may_have_any_name():
+    with pytest.raises(UserError, match='a training has only the numbers'):
+        preset('fast', **{'name': 1})

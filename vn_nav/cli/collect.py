@@ -15,7 +15,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_world(parser)
     parser.add_argument('--houses', type=int, metavar='N', help='the first N training houses')
     parser.add_argument('--pictures', type=int, default=20_000,
-                           help='in all (thesis, 5.7: 20,000)')
+                        help='in all (thesis, 5.7: 20,000)')
     parser.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
     parser.add_argument('--threads', type=int, default=1, help='that draw')
     parser.add_argument('--out', type=Path, required=True, help='folder of the bag')

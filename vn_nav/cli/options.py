@@ -13,11 +13,10 @@ from typing import Any
 
 from vn_nav.errors import UserError
 
-GOALS = 1000  # as `PlaceOptions.goals`, which the help of a command does not wait for
-
 
 def add_place_options(parser: argparse.ArgumentParser) -> None:
     """How pictures become a place."""
+    from vn_nav.bags.mapping.recorded_place import GOALS
     parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
     parser.add_argument('--margin', type=float, metavar='M',
                         help='beside the driven path that counts as free [m]; default 0.3')
@@ -33,6 +32,7 @@ def add_place_options(parser: argparse.ArgumentParser) -> None:
 
 def given_place_options(args: argparse.Namespace) -> list[str]:
     """Names of those that differ from their default."""
+    from vn_nav.bags.mapping.recorded_place import GOALS
     given = {'--topics': args.topics, '--margin': args.margin, '--cache': args.cache,
              '--pictures': args.pictures,
              '--no-straighten': None if args.straighten else True,
