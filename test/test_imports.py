@@ -74,6 +74,12 @@ def test_dependencies(path):
     package = name_of(path).partition('.')[0]
     if package == 'vn_nav' and not name_of(path).startswith('vn_nav.cli.'):
         assert 'vn_sim_bridge' not in roots(path), 'only vn_nav.cli composes with the simulator'
+    own = {node.module for node in ast.walk(ast.parse(path.read_text()))
+           if isinstance(node, ast.ImportFrom) and node.module.partition('.')[0] in PACKAGES}
+    places = {name: ROOT / name.replace('.', '/') for name in own}
+    missing = [name for name, place in places.items()
+               if not (place.with_suffix('.py').is_file() or place.is_dir())]
+    assert not missing, f'no such module, in a function perhaps: {missing}'
     if not name_of(path).startswith('vn_nav.cli.'):
         assert 'argparse' not in roots(path), 'options of a command end in vn_nav.cli'
     if package == 'vn_sim_bridge':

@@ -8,7 +8,7 @@ import pytest
 
 from vn_nav.cli.train import add_train_options, train_config
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import TASKS
+from vn_nav.learning.learner_config import TASKS
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.robot import DRIVE_ACTIONS
 

@@ -10,7 +10,8 @@ from torch.nn import functional as F
 from two_bars import TwoBars, collected
 
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import Learner, LearnerConfig
+from vn_nav.learning.learner import Learner
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, preset
 from vn_nav.learning.rollout import Collector
 from vn_nav.observation import Observation

@@ -94,7 +94,7 @@ def run_doctor(args) -> int:
 
 def run_recover(args) -> int:
     """`vn_nav bag recover`: 0, with what was lost told; if strict, 2 where something was."""
-    from vn_nav.bags.doctor.checks.recover import recover
+    from vn_nav.bags.doctor.recover import recover
     recovered = recover(args.bag, args.out)
     print('\n'.join(recovered.lines()))
     return 2 if args.strict and recovered.lost else 0

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Collection
 
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import PRIVILEGED
+from vn_nav.learning.learner_config import PRIVILEGED
 from vn_nav.learning.presets import TrainConfig
 
 

@@ -23,7 +23,7 @@ import re
 import typing
 
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import LearnerConfig
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.policy.encoders import LARGE
 from vn_nav.policy.network import NetworkConfig
 

@@ -19,10 +19,10 @@ from vn_nav.bags.mapping.recorded_place import scene_of
 from vn_nav.bags.roles import Topics
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split
+from vn_nav.learning.precision import fast_dtype
 from vn_nav.learning.presets import TrainConfig, preset
 from vn_nav.learning.pretraining import PretrainConfig, choose_parts, pretrain_network
 from vn_nav.learning.supervised import PARTS
-from vn_nav.learning.trainer import has_fast_bfloat16
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -96,8 +96,7 @@ def pretrain(job: PretrainJob, *, say: Callable[[str], None] = print_line) -> Pa
         say(line)
     torch.set_num_threads(train.threads)
     policy = _policy(network, parts, given, numbers.seed).to(train.device)
-    policy.compute_dtype = (torch.bfloat16 if has_fast_bfloat16() or train.device != 'cpu'
-                            else torch.float32)
+    policy.compute_dtype = fast_dtype(train.device)
     info = {
         'world_version': worlds.pop() if len(worlds) == 1 else RECORDED,
         'camera_fov_deg': math.degrees(robot.camera_fov), 'camera_height': robot.camera_height,

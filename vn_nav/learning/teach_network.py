@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from vn_nav.learning.precision import fast_dtype
 from vn_nav.learning.presets import TrainConfig
-from vn_nav.learning.trainer import has_fast_bfloat16
 from vn_nav.policy.network import Policy
 from vn_nav.robot import RobotSpec
 
@@ -31,7 +31,7 @@ def network_for_place(config: TrainConfig, robot: RobotSpec, size: int, seed: in
                                         robot.moves if config.track_goal else ()))
     if given is not None:
         network.load_state_dict(_widened(given.state_dict(), network))
-    network.compute_dtype = torch.bfloat16 if has_fast_bfloat16() else torch.float32
+    network.compute_dtype = fast_dtype()
     return network
 
 

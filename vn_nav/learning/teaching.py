@@ -36,7 +36,8 @@ from vn_nav.learning.teach_evaluation import (
 )
 from vn_nav.learning.teach_job import PRESET, SIZE, TeachJob, numbers
 from vn_nav.learning.teach_network import OWN, blend, network_for_place
-from vn_nav.learning.trainer import CHECKPOINT, STATE, train
+from vn_nav.learning.trainer import train
+from vn_nav.learning.training import CHECKPOINT, STATE
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec

@@ -12,55 +12,17 @@ their topic is `shadow/cmd_vel` in a namespace that is made up for this run.
 from __future__ import annotations
 
 import dataclasses
-import fcntl
-import json
-import os
-import secrets
 import tempfile
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import IO
 
-import numpy as np
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Twist
-from nav_msgs.msg import Odometry
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.serialization import deserialize_message, serialize_message
-from rclpy.signals import SignalHandlerOptions
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Bool, Int8, String
-from std_srvs.srv import SetBool
-
-from vn_msgs_py.images import fill_image
-from vn_msgs_py.motion import twist_to_array
-from vn_msgs_py.topics import Topic, topic
-from vn_nav.bags.shadow.plan import RESOLUTION, Decision, Event, Plan, stamped
+from vn_nav.bags.shadow.plan import Plan
 from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
-from vn_nav.nodes.policy_node import SHADOW_LIMIT
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.processes import Processes, ProcessFailure
-from vn_nav.nodes.qos import qos
-
-DOMAINS = range(215, 233)  # beyond those that people choose; they leave Linux's ports alone
-ALONE = 3.0  # s in which others on a domain are heard of, also on a busy machine
-LOOK = 0.25  # s between looks at who is there
-PATIENCE = 120.0  # s for an answer: a busy machine starts the node slowly
-AGAIN = 0.3  # s without a picture, or an answer to it, after which it is shown again
-ARMING = 10_000_000_000, 1_000_000  # ns before the drive, and between the pictures there
-# What the policy publishes, by the names that the node gives it.
-HEARD = {'shadow/cmd_vel': Twist, 'action': Int8, 'action_names': String, 'arrived': Bool,
-         'diagnostics': DiagnosticArray}
-# What it is shown, beside the pictures.
-SHOWN = {'camera_info': CameraInfo, 'odom': Odometry, 'goal_image': Image, 'clock': Clock,
-         'executed_action': String}
-ABSOLUTE = ('clock', 'diagnostics')  # in the contract; here they are in the namespace as well
+from vn_nav.nodes.shadow_domain import DOMAINS, Domain
+from vn_nav.nodes.shadow_stage import ABSOLUTE, Stage, shadow_topics
 
 
 @dataclasses.dataclass
@@ -70,21 +32,6 @@ class Driven:
     bag: Path  # the second one
     complete: bool  # else a signal ended it
     latencies: list[float]  # s of each decision, from the picture to its answer
-
-
-class _Interrupted(Exception):
-    """A signal has come."""
-
-
-def shadow_topics() -> list[Topic]:
-    """What the second bag holds. Below /shadow: playing it moves no robot either."""
-    return [dataclasses.replace(topic(_contract(name)), name=in_bag(name))
-            for name in (*HEARD, 'goal_image', 'executed_action')]
-
-
-def in_bag(name: str) -> str:
-    """The name of a topic in the second bag."""
-    return f'/shadow/{name.removeprefix("shadow/")}'
 
 
 def drive(plan: Plan, checkpoint: str | Path, out: str | Path, *, robot: Path | None = None,
@@ -107,13 +54,13 @@ def drive(plan: Plan, checkpoint: str | Path, out: str | Path, *, robot: Path | 
     """
     ended = Ended()
     try:
-        with (_Domain(domains) as domain, tempfile.TemporaryDirectory() as logs,
+        with (Domain(domains) as domain, tempfile.TemporaryDirectory() as logs,
               BagWriter(out, shadow_topics()) as bag):
             say(f'ROS domain {domain.number}, namespace {domain.namespace}: the commands end '
                 'there')
             processes = Processes(Path(logs))
             processes.environment['ROS_DOMAIN_ID'] = str(domain.number)
-            stage = _Stage(plan, domain, bag, processes, ended)
+            stage = Stage(plan, domain, bag, processes, ended)
             try:
                 processes.start('policy', 'vn_nav.nodes.policy_node', {
                     'checkpoint': str(checkpoint), 'robot': str(robot or ''), 'mode': 'shadow',
@@ -131,328 +78,3 @@ def drive(plan: Plan, checkpoint: str | Path, out: str | Path, *, robot: Path | 
         return Driven(Path(out), complete, stage.latencies)
     finally:
         ended.restore()
-
-
-def _contract(name: str) -> str:
-    return f'/{name}' if name in ABSOLUTE else name
-
-
-class _Domain:
-    """A ROS domain that nobody else is on, with a node of ours there; a context manager."""
-
-    def __init__(self, domains: Iterable[int]):
-        self.namespace = f'/vn_nav_shadow_{os.getpid()}_{secrets.token_hex(4)}'
-        taken = []
-        for self.number in domains:
-            self._lock = _lock(self.number)
-            if self._lock is None:
-                taken.append(f'{self.number}: another shadow')
-                continue
-            self._join()
-            end = time.monotonic() + ALONE
-            while time.monotonic() < end and not self.strangers():
-                self.executor.spin_once(timeout_sec=0.05)
-            if not (strangers := self.strangers()):
-                return
-            taken.append(f'{self.number}: {", ".join(strangers)}')
-            self.close()
-        raise UserError('shadow mode takes a ROS domain that nobody else is on',
-                        '; '.join(taken), 'end some of them')
-
-    def _join(self) -> None:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, domain_id=self.number,
-                   signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node('shadow', namespace=self.namespace, context=self._context,
-                         start_parameter_services=False, enable_rosout=False)
-        self.executor = SingleThreadedExecutor(context=self._context)
-        self.executor.add_node(self.node)
-
-    def strangers(self) -> list[str]:
-        """Whoever else is on the domain, or listens to the commands."""
-        nodes = {f'{space.rstrip("/")}/{name}'
-                 for name, space in self.node.get_node_names_and_namespaces()
-                 if space != self.namespace}
-        commands = f'{self.namespace}/shadow/cmd_vel'
-        listeners = {f'{info.node_name}, which listens to {commands}'
-                     for info in self.node.get_subscriptions_info_by_topic(commands)
-                     if info.node_name != self.node.get_name()}
-        return sorted(nodes | listeners)
-
-    def close(self) -> None:
-        """Leave the domain to others."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-        self._lock.close()
-
-    def __enter__(self) -> _Domain:
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.close()
-
-
-def _lock(number: int) -> IO | None:
-    """Keep other shadows of this host away from a domain; None: one is there."""
-    try:
-        file = open(Path(tempfile.gettempdir(), f'vn_nav_shadow_domain_{number}.lock'), 'a')
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # taken, or the file is another user's
-        return None
-    return file
-
-
-class _Stage:
-    """This process in the place of the robot, and the recorder of what the policy says.
-
-    Args:
-        plan: the drive.
-        domain: where the policy node is.
-        bag: for what it says.
-        processes: with the child `policy`.
-        ended: says that a signal has come.
-    """
-
-    def __init__(self, plan: Plan, domain: _Domain, bag: BagWriter, processes: Processes,
-                 ended: Ended):
-        self._plan, self._domain, self._bag = plan, domain, bag
-        self._processes, self._ended = processes, ended
-        self.latencies: list[float] = []
-        self._node = node = domain.node
-        image, kind = (('image_raw/compressed', CompressedImage) if plan.compressed
-                       else ('image_raw', Image))
-        self._out = {name: node.create_publisher(kind, name, qos(_contract(name)))
-                     for name, kind in (SHOWN | {image: kind}).items()}
-        self._image = self._out[image]
-        self._enabler = node.create_client(SetBool, 'policy_node/enable')
-        hear = {'shadow/cmd_vel': self._hear_command, 'action': self._hear_action,
-                'action_names': self._hear_names, 'arrived': self._hear_arrived,
-                'diagnostics': self._hear_diagnostics}
-        for name, kind in HEARD.items():
-            node.create_subscription(kind, name, self._recording(name, kind, hear[name]),
-                                     qos(_contract(name), depth=100), raw=True)
-        self._log_time = 0  # ns, by which the second bag has what is said now
-        self._now = 0  # ns, of the node's clock
-        self._look_at = 0.0
-        self._names: list[str] = []
-        self._commands: list[np.ndarray] = []  # that were not waited for yet
-        self._rests = True  # says the last command
-        self._choice: str | None = None  # what the policy has said of the picture
-        self._statements = 0  # on `arrived`
-        self._has_arrived = False
-        self._diagnosis: dict[str, str] = {}
-        self._episode: int | None = None
-        self._pose = serialize_message(Odometry())  # where there is no odometry: it stands
-        self._pose_stamp = 0
-        self._picture: bytes | None = None
-        self._picture_stamp = 0
-        self._shown_at = 0.0
-
-    # What the policy says.
-
-    def _recording(self, name: str, kind: type, hear: Callable) -> Callable[[bytes], None]:
-        def take(data: bytes) -> None:
-            self._bag.write(in_bag(name), data, self._log_time)
-            hear(deserialize_message(data, kind))
-        return take
-
-    def _hear_command(self, message: Twist) -> None:
-        self._commands.append(twist_to_array(message))
-
-    def _hear_action(self, message: Int8) -> None:
-        self._choice = self._names[message.data]
-
-    def _hear_names(self, message: String) -> None:
-        self._names = json.loads(message.data)
-
-    def _hear_arrived(self, message: Bool) -> None:
-        self._statements += 1
-        self._has_arrived = message.data
-        if message.data:
-            self._choice = 'arrived'
-
-    def _hear_diagnostics(self, message: DiagnosticArray) -> None:
-        self._diagnosis = {pair.key: pair.value for pair in message.status[0].values}
-
-    # What it is shown.
-
-    def play(self) -> bool:
-        """Show the drive, from its beginning to its end; False: a signal has ended it."""
-        try:
-            for event in self._plan.events():
-                self._check()
-                if event is not None:
-                    self._take(event)
-                if self._picture and time.monotonic() - self._shown_at > AGAIN:
-                    self._show(self._picture, 0)  # the node's watchdog looks at the wall clock
-        except _Interrupted:
-            return False
-        return True
-
-    def _take(self, event: Event) -> None:
-        self._log_time = max(self._log_time, event.log_time)
-        if event.decision is not None:
-            self._decide(event, event.decision)
-        elif event.picture:
-            self._show(event.data, event.stamp)
-        else:
-            self._pose = event.data or self._pose
-            self._tick(event.stamp)
-
-    def _decide(self, event: Event, decision: Decision) -> None:
-        """Show a picture and hear what the policy would do there."""
-        if decision.episode != self._episode:
-            self._begin(event, decision.episode)
-        elif self._has_arrived:
-            self._look_again()
-        stamp = max(event.stamp, self._picture_stamp + RESOLUTION)
-        told = String(data=json.dumps({'stamp': divmod(stamp, 10**9), 'action': decision.done}))
-        self._out['executed_action'].publish(told)
-        self._bag.write(in_bag('executed_action'), serialize_message(told), self._log_time)
-        self._choice, begun = None, time.monotonic()
-        self._show(event.data, stamp)
-        self._until(lambda: self._choice is not None, 'a decision', resend=True)
-        self.latencies.append(time.monotonic() - begun)
-        if self.latencies[-1] > SHADOW_LIMIT:  # the node has discarded it
-            raise UserError(f'a decision takes less than {SHADOW_LIMIT:g} s',
-                            f'{self.latencies[-1]:.1f} s',
-                            'try again when the machine is less busy')
-        if self._rests and not self._has_arrived:
-            self._take_command()  # the first of a motion comes by itself
-        else:
-            self._tick(stamp)
-
-    def _begin(self, event: Event, episode: int) -> None:
-        """Show the goal of an episode."""
-        picture = self._plan.goals.picture(episode)
-        if picture is None:
-            raise UserError('an episode has a goal picture that can be decoded',
-                            f'episode {episode}', 'give one with --goal')
-        if self._episode is None:
-            self._until(self._is_matched, 'the policy node to appear')
-            self._until(lambda: self._statements and self._names, 'the policy node to be active')
-        elif self._has_arrived:
-            self._look_again()
-        goal = fill_image(Image(), picture)
-        goal.header.stamp.sec, goal.header.stamp.nanosec = divmod(
-            event.stamp - 2 * RESOLUTION, 10**9)
-        said = self._statements
-        self._out['goal_image'].publish(goal)
-        self._bag.write(in_bag('goal_image'), serialize_message(goal), self._log_time)
-        self._until(lambda: self._statements > said, 'an answer to the goal picture')
-        if self._episode is None:
-            self._arm(event)
-        self._tick(event.stamp)  # a new goal holds the node until the next command
-        self._episode = episode
-
-    def _is_matched(self) -> bool:
-        return self._enabler.service_is_ready() and all(
-            publisher.get_subscription_count() for publisher in self._out.values())
-
-    def _arm(self, event: Event) -> None:
-        """Show healthy pictures until the node may be enabled."""
-        (before, step), end = ARMING, time.monotonic() + PATIENCE
-        stamp, ask_at, answer = event.stamp - before, 0.0, 'nothing'
-        # Once, and long before the node may move: whatever comes after that is answered.
-        self._out['odom'].publish(stamped(self._pose, event.stamp))
-        while True:
-            stamp += step
-            self._image.publish(stamped(event.data, stamp))
-            if self._plan.camera_info is not None:
-                self._out['camera_info'].publish(stamped(self._plan.camera_info, event.stamp))
-            self._domain.executor.spin_once(timeout_sec=0.03)
-            self._check()
-            camera = self._diagnosis.get('camera_fov_deg', 'unknown') != 'unknown'
-            if time.monotonic() > ask_at and (camera or self._plan.camera_info is None):
-                granted, answer = self._enable()
-                if granted:
-                    return
-                ask_at = time.monotonic() + LOOK
-            if time.monotonic() > end:
-                raise UserError('the policy node can be enabled', answer, 'see what it misses')
-
-    def _look_again(self) -> None:
-        """After a statement of arrival: on with the same goal, with an empty memory."""
-        said = self._statements
-        granted, answer = self._enable()
-        if not granted:
-            raise UserError('the policy node can be enabled again', answer,
-                            'try again when the machine is less busy')
-        self._until(lambda: self._statements > said, 'that it does not stand there any more')
-
-    def _enable(self) -> tuple[bool, str]:
-        future = self._enabler.call_async(SetBool.Request(data=True))
-        self._until(future.done, 'an answer of ~/enable')
-        return future.result().success, future.result().message
-
-    def _show(self, data: bytes, stamp: int) -> None:
-        self._picture_stamp = max(stamp, self._picture_stamp + RESOLUTION)
-        self._picture = stamped(data, self._picture_stamp)
-        self._set_clock(self._picture_stamp)
-        self._image.publish(self._picture)
-        self._shown_at = time.monotonic()
-
-    def _tick(self, stamp: int) -> None:
-        """Odometry, which the node answers with a command."""
-        self._pose_stamp = max(self._pose_stamp, stamp)
-        self._check_unasked()
-        self._set_clock(self._pose_stamp)
-        self._out['odom'].publish(stamped(self._pose, self._pose_stamp))
-        self._take_command()
-
-    def _set_clock(self, stamp: int) -> None:
-        if stamp > self._now:
-            self._now = stamp
-            clock = Clock()
-            clock.clock.sec, clock.clock.nanosec = divmod(stamp, 10**9)
-            self._out['clock'].publish(clock)
-
-    def _take_command(self) -> None:
-        self._until(lambda: self._commands, 'a command')
-        self._rests = not self._commands.pop(0).any()
-        self._check_unasked()
-
-    def _check_unasked(self) -> None:
-        if self._commands:
-            raise UserError('the policy node answers with one command',
-                            f'{len(self._commands)} more', 'report this')
-
-    # Waiting.
-
-    def _until(self, condition: Callable, what: str, *, resend: bool = False) -> None:
-        """Serve what comes in until a condition holds."""
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            self._check()
-            if time.monotonic() > end:
-                raise UserError(f'the policy node answers within {PATIENCE:g} s',
-                                f'waited for {what}; it says {self._state()}',
-                                'try again when the machine is less busy')
-            if resend and time.monotonic() - self._shown_at > AGAIN:
-                self._image.publish(self._picture)  # pictures may be lost; it knows one it has
-                self._shown_at = time.monotonic()
-            self._domain.executor.spin_once(timeout_sec=0.05)
-
-    def _check(self) -> None:
-        """Whether it may go on: nobody else is there, the node lives, and no signal has come."""
-        if self._ended.is_set():
-            raise _Interrupted
-        now = time.monotonic()
-        if now < self._look_at:
-            return
-        self._look_at = now + LOOK
-        self._processes.check('policy')
-        if self._processes.running['policy'].poll() is not None:
-            raise ProcessFailure('the policy node has ended')
-        if strangers := self._domain.strangers():
-            raise UserError('shadow mode has its ROS domain for itself',
-                            f'domain {self._domain.number}: {", ".join(strangers)}',
-                            'end it, or run again: another domain is taken')
-        if self._diagnosis.get('state') == 'stopped':
-            raise UserError('the policy node goes on to the end of the drive', self._state(),
-                            'try again when the machine is less busy')
-
-    def _state(self) -> str:
-        return ': '.join(filter(None, (self._diagnosis.get(key, '') for key in (
-            'state', 'reason')))) or 'nothing'
