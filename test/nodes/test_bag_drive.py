@@ -248,7 +248,8 @@ def test_a_domain_where_somebody_is_is_not_taken(stranger, monkeypatch):
     with pytest.raises(UserError, match='231: .*stranger'):
         shadow_domain.Domain([231])
     monkeypatch.setattr(shadow_domain, 'ALONE', 0.1)
-    with shadow_domain.Domain(range(225, 230)) as one, shadow_domain.Domain(range(225, 231)) as other:
+    with (shadow_domain.Domain(range(225, 230)) as one,
+          shadow_domain.Domain(range(225, 231)) as other):
         assert one.number != other.number and one.namespace != other.namespace
         with pytest.raises(UserError, match='another shadow'):
             shadow_domain.Domain([one.number])
