@@ -70,9 +70,9 @@ def test_thesis_learns_in_what_table_5_1_says():
 @pytest.mark.parametrize('size, cells, cell', [(84, 20, 4), (174, 42, 4)])
 def test_thesis_has_downsize_factor_4_and_its_heads(size, cells, cell):
     """Table 5.1: pixel control and auxiliary VN downsize factor."""
-    from vn_nav.policy.network import Policy
+    from vn_nav.policy.zhu_policy import build_policy
     config = preset('thesis').network(DRIVE_ACTIONS, size)
-    network = Policy(config)
+    network = build_policy(config)
     assert (network.target_side, network.cell) == (cells, cell)
     assert set(config.heads) == {'pixel_control', 'reward_prediction', 'depth', 'segmentation',
                                  'goal_segmentation'}

@@ -30,8 +30,8 @@ from vn_nav.learning.rollout import Collector, Episode, Rollout
 from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
 from vn_nav.learning.training_state import initial_weights, restore, state_of
 from vn_nav.policy.checkpoint import save_checkpoint
-from vn_nav.policy.network import Policy
 from vn_nav.policy.resnet import load_frozen_weights
+from vn_nav.policy.zhu_policy import build_policy
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
@@ -56,8 +56,8 @@ class Training:
         size = env.goals.shape[-1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = Policy(config.network(tuple(env.action_names), size,
-                                                 env.robot.moves if config.track_goal else ()))
+            self.network = build_policy(config.network(
+                tuple(env.action_names), size, env.robot.moves if config.track_goal else ()))
         if config.frozen_weights:
             load_frozen_weights(self.network.encoder.frozen, config.frozen_weights)
         self.network.to(config.device)
