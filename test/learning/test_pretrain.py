@@ -68,7 +68,7 @@ def test_actions_and_poses_are_learned_and_hold_on_other_episodes(tmp_path):
     first, second = rows_of(spans), partners(spans, np.random.default_rng(1))
     asked = {'image': drives.pictures('image', first), 'goal': drives.pictures('image', second),
              'goal_pose': drives.label(first, second).goal_pose,
-             'overlap': drives.overlap(first, second)}
+             'overlap': drives.co_visibility(first, second)}
     learned = measure(load_checkpoint(tmp_path / 'checkpoint').network, asked)
     mean = torch.from_numpy(asked['goal_pose'][asked['overlap'] >= POSE_OVERLAP].mean(axis=0))
     guess = errors(Pose(*mean.expand(len(first), 4).split(2, dim=1), torch.ones(len(first))),

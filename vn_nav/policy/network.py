@@ -409,7 +409,7 @@ def _compass(pose: Pose) -> Tensor:
 
     Without gradient: the pose is learned from poses, not bent to please the actor.
     """
-    sure = torch.sigmoid(pose.overlap).unsqueeze(1)
+    sure = torch.sigmoid(pose.co_visible).unsqueeze(1)
     return torch.cat([sure * pose.position / 3.0, sure * pose.heading, sure], dim=1).detach()
 
 
