@@ -50,7 +50,7 @@ def one_thread():
 def network_of(name):
     """A network whose actions differ clearly, unlike those of a new one."""
     network = build_policy(NetworkConfig(**{'actions': DRIVE_ACTIONS, 'size': 64, 'hidden': 32,
-                                      **NETWORKS[name]})).eval()
+                                            **NETWORKS[name]})).eval()
     for part in network.actor.parameters():
         part.data.normal_()
     return network

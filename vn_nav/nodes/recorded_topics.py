@@ -29,7 +29,7 @@ class RecordedTopics:
         self._writer = BagWriter(bag) if bag is not None else None
 
     def hear(self, kind: type, name: str, handle: Callable[[Any], None], *,
-              history: bool = True, anybody: bool = False) -> None:
+             history: bool = True, anybody: bool = False) -> None:
         """Subscribe to a topic of the contract.
 
         Args:
