@@ -153,7 +153,7 @@ class Senses:
         with self._wake:
             # Pictures up to then belong to the episode before.
             self._navigator.accept_goal(_seconds(stamp) if self._lock_step else
-                                       self._now() + self._navigator.limits.settle_time)
+                                        self._now() + self._navigator.limits.settle_time)
             self.goal, self.frame = picture, None
             self.goals += 1
             self._wake.notify_all()
