@@ -185,6 +185,8 @@ def _print(diagnosis) -> None:
         style = 'bold red' if finding.severity == 'error' else 'yellow'
         console.print(Text.assemble((f'{finding.severity}: ', style), f'{where} '
                                     f'{finding.what}{first}; {finding.remedy}'))
+    for note in diagnosis.notes:
+        console.print(Text(f'note: {note}'))
     if not diagnosis.findings:
         console.print(Text.assemble(('ok: ', 'green'), 'nothing is wrong with it'))
 

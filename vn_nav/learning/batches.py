@@ -33,7 +33,8 @@ def select(rollout: Rollout, columns: Tensor, few_goals: bool = True) -> Rollout
                else RecurrentState(*(rows[columns] for rows in rollout.state))),
         privileged={key: part(rows) for key, rows in rollout.privileged.items()},
         driven=part(rollout.driven),
-        log_probability=part(rollout.log_probability), value=part(rollout.value))
+        log_probability=part(rollout.log_probability), value=part(rollout.value),
+        filter_offsets=part(rollout.filter_offsets))
 
 
 def few_goals_of(observation: Observation) -> Observation:

@@ -152,7 +152,10 @@ class Learner:
         latents, _ = self.network.latents(acting_rows(batch.observation), batch.starts[:-1],
                                           batch.state)
         output = self.network.read(latents)
-        log_all = torch.log_softmax(output.logits, dim=-1)
+        logits = output.logits
+        if batch.filter_offsets is not None:  # the actions were chosen behind the action filter
+            logits = logits + batch.filter_offsets
+        log_all = torch.log_softmax(logits, dim=-1)
         log_new = log_all.gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
         log_ratio = log_new - batch.log_probability
         ratio = log_ratio.exp()

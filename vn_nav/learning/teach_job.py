@@ -10,6 +10,7 @@ from typing import Any
 from vn_nav.bags.mapping.recorded_place import PlaceOptions
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig, preset
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.robot import RobotSpec
 
@@ -92,7 +93,9 @@ def numbers(job: TeachJob, given: LoadedCheckpoint | None, minutes: float,
             raise UserError('an encoder that learns is taught', f'{job.checkpoint}, whose '
                             'encoder is frozen', 'choose another --checkpoint')
         own |= {'pair_minutes': 0.0, 'stacked_frames': network.frames,
-                'track_goal': bool(network.moves), **{name: getattr(network, name) for name in (
+                'track_goal': bool(network.moves),
+                'action_filter': network.filter_name != NONE or not network.moves,
+                **{name: getattr(network, name) for name in (
                     'architecture', 'channels', 'blocks', 'features', 'hidden', 'deconvolutions',
                     'pose_to_memory', 'pixel_mean', 'pixel_std')}}
     return preset(PRESET, **{'seed': job.seed, 'threads': job.threads, **own, **job.changes})

@@ -30,7 +30,7 @@ def network_for_place(config: TrainConfig, robot: RobotSpec, size: int, seed: in
         network = Policy(config.network(robot.action_names, size,
                                         robot.moves if config.track_goal else ()))
     if given is not None:
-        network.load_state_dict(_widened(given.state_dict(), network))
+        network.load_state_dict(widened(given.state_dict(), network))
     network.compute_dtype = fast_dtype()
     return network
 
@@ -43,7 +43,7 @@ def blend(network: Policy, own: float) -> None:
             part *= share
 
 
-def _widened(given: dict[str, torch.Tensor], network: Policy) -> dict[str, torch.Tensor]:
+def widened(given: dict[str, torch.Tensor], network: Policy) -> dict[str, torch.Tensor]:
     """Weights of a policy, for one whose memory is told of places as well: not yet listened to."""
     own = network.state_dict()
     for name, tensor in own.items():

@@ -107,6 +107,8 @@ def restore(training: Training, state: dict) -> None:
 def _identity(training: Training) -> dict:
     """What must not change between save and resumption."""
     network = dataclasses.asdict(training.network.config)
+    if training.config.action_filter:  # of before there was a choice: they know no such key
+        del network['action_filter']
     return {
         'bags': None if training.bags is None else training.bags.identity,
         'action names': list(network.pop('actions')),

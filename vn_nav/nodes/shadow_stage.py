@@ -27,10 +27,12 @@ from vn_nav.nodes.policy_node import SHADOW_LIMIT
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.nodes.shadow_domain import Domain
 
 LOOK = 0.25  # s between looks at who is there
 PATIENCE = 120.0  # s for an answer: a busy machine starts the node slowly
+LAST_WORDS = 5.0  # s for diagnostics after the last decision
 AGAIN = 0.3  # s without a picture, or an answer to it, after which it is shown again
 ARMING = 10_000_000_000, 1_000_000  # ns before the drive, and between the pictures there
 # What the policy publishes, by the names that the node gives it.
@@ -144,9 +146,18 @@ class Stage:
                     self._take(event)
                 if self._picture and time.monotonic() - self._shown_at > AGAIN:
                     self._show(self._picture, 0)  # the node's watchdog looks at the wall clock
+            self._hear_the_last_counts()
         except _Interrupted:
             return False
         return True
+
+    def _hear_the_last_counts(self) -> None:
+        """Diagnostics come once a second: those after the last decision belong in the bag."""
+        end = time.monotonic() + LAST_WORDS
+        while (int(self._diagnosis.get('filter_decisions', len(self.latencies)))
+               < len(self.latencies) and time.monotonic() < end):
+            self._check()
+            self._domain.executor.spin_once(timeout_sec=0.05)
 
     def _take(self, event: Event) -> None:
         self._log_time = max(self._log_time, event.log_time)
@@ -240,9 +251,9 @@ class Stage:
         self._until(lambda: self._statements > said, 'that it does not stand there any more')
 
     def _enable(self) -> tuple[bool, str]:
-        future = self._enabler.call_async(SetBool.Request(data=True))
-        self._until(future.done, 'an answer of ~/enable')
-        return future.result().success, future.result().message
+        call = ServiceCall(self._enabler, SetBool.Request(data=True))
+        self._until(call.is_answered, 'an answer of ~/enable')
+        return call.answer.success, call.answer.message
 
     def _show(self, data: bytes, stamp: int) -> None:
         self._picture_stamp = max(stamp, self._picture_stamp + RESOLUTION)
