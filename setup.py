@@ -9,10 +9,10 @@ NAME = 'vn_nav'
 PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 EXECUTABLES = {
     'vn_nav': 'vn_nav.cli:main',
-    'goal_node': 'vn_nav.cli_nodes:goal_node',
-    'policy_node': 'vn_nav.cli_nodes:policy_node',
-    'recorder_node': 'vn_nav.cli_nodes:recorder_node',
-    'sim_bridge_node': 'vn_nav.cli_nodes:sim_bridge_node',
+    'goal_node': 'vn_nav.cli.nodes:goal_node',
+    'policy_node': 'vn_nav.cli.nodes:policy_node',
+    'recorder_node': 'vn_nav.cli.nodes:recorder_node',
+    'sim_bridge_node': 'vn_nav.cli.nodes:sim_bridge_node',
 }
 # `ros2 run` looks in lib/vn_nav, where pip puts no scripts: this one leads on to bin/.
 THIN_EXECUTABLE = """#!/bin/sh

@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.topics import BEST_EFFORT, LATCHED, topic
-from vn_nav.demo import Processes
+from vn_nav.nodes.processes import Processes
 from vn_nav.resources import share_file
 
 FOLDER = Path(__file__).resolve().parent

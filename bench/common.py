@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from vn_nav.cli_world import machine
+from vn_nav.cli.world import machine
 
 ROUNDS = 9
 

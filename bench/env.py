@@ -11,13 +11,13 @@ import sys
 import numpy as np
 from common import ROUNDS, frames_per_second, pin, report
 
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
-from vn_sim_bridge.randomisation import load_randomisation
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.render.rasterizer import Rasterizer
 
 ENVS = 64
 MEMORY = f"""
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 import numpy as np
 env = NavigationEnv(EnvConfig(houses=tuple(range(16)), rooms=6, num_envs={ENVS}))
 env.reset(seed=0)

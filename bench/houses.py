@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from vn_nav.cli_world import machine
+from vn_nav.cli.world import machine
 from vn_sim_bridge.houses import procedural
 from vn_sim_bridge.houses.house import main_component
 from vn_sim_bridge.houses.procedural import MAX_ROOMS, generate_house

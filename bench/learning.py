@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 from vn_nav.errors import UserError
-from vn_nav.evaluation.curves import HOLD, THRESHOLDS, reached, read_runs
+from vn_nav.report.curves import HOLD, THRESHOLDS, reached, read_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 CURVES = ROOT / 'docs' / 'curves' / 'table'

@@ -1,11 +1,11 @@
-"""How far odometry goes astray over a long drive, and how far `vn_nav.bags.loops` brings it back.
+"""How far odometry drifts over a long drive, and what `mapping.loop_closure` makes of it.
 
     python bench/loops.py --houses 12000 12001 --minutes 10 --size 128 --drift 1
 
 A robot drives a tour of an embedded house: places about a metre apart, at each first visit a full
 turn, every stretch at least twice. The pictures are rendered in one light and through one camera
 of the randomisation, which the robot does not know, with noise and blur. Its odometry goes astray
-as `vn_sim_bridge.odometry` has it. A table compares odometry and what is made of it with the
+as `vn_sim_bridge.robot.odometry` has it. A table compares odometry and what is made of it with the
 truth; a closure is false where it lies farther than `FALSE` from what really relates its two
 pictures.
 """
@@ -23,15 +23,15 @@ import numpy as np
 from common import pin
 
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.loops import between, straighten
+from vn_nav.bags.mapping.loop_closure import between, straighten
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
-from vn_sim_bridge.backends.base import Frames
-from vn_sim_bridge.backends.house import HouseBackend
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.houses.house import CELL, House
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.odometry import advance, drift_errors
-from vn_sim_bridge.randomisation import load_randomisation
+from vn_sim_bridge.render.randomisation import load_randomisation
+from vn_sim_bridge.robot.odometry import advance, drift_errors
+from vn_sim_bridge.simulator import Frames
+from vn_sim_bridge.simulators.house import HouseBackend
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 RATE = 8.0  # pictures a second
@@ -137,7 +137,7 @@ def drift(poses: np.ndarray, factor: float, scale: float, seed: int) -> np.ndarr
 
     Args:
         poses: the truth.
-        factor: of the errors of `vn_sim_bridge.odometry`.
+        factor: of the errors of `vn_sim_bridge.robot.odometry`.
         scale: share by which all ways and turns are counted too long.
         seed: of the errors.
     """

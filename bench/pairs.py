@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from common import pin
 
-from vn_nav.cli_world import machine
+from vn_nav.cli.world import machine
 from vn_nav.learning.pairs import PairConfig, look, pretrain_pairs
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS
+from vn_sim_bridge.datasets.house_pairs import PairSampler
 from vn_sim_bridge.houses.splits import SPLITS
-from vn_sim_bridge.pairs import PairSampler
-from vn_sim_bridge.randomisation import load_randomisation
+from vn_sim_bridge.render.randomisation import load_randomisation
 
 ENCODERS = {
     'fused': {'architecture': 'fused', 'channels': (32, 64, 64)},

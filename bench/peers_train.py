@@ -17,7 +17,7 @@ from torch import nn
 from torch.distributions import Categorical
 
 from vn_sim_bridge.counter_random import Stream, key
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 ENVS, STEPS = 64, 32  # of a rollout
 EPOCHS, MINIBATCHES = 2, 4

@@ -24,11 +24,11 @@ from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
-from vn_sim_bridge.randomisation import draw_appearance, load_randomisation
 from vn_sim_bridge.render.pack import Lights
+from vn_sim_bridge.render.randomisation import draw_appearance, load_randomisation
 from vn_sim_bridge.render.rasterizer import Rasterizer
+from vn_sim_bridge.render.scene import Scene, SceneBuilder
 from vn_sim_bridge.render.sensor import expose
-from vn_sim_bridge.scene import Scene, SceneBuilder
 
 POSES, BATCH = 64, 16
 FOV = math.radians(90)

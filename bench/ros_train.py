@@ -23,13 +23,13 @@ from pathlib import Path
 import numpy as np
 from common import pin, report
 
-from vn_nav.learning.command import config_over_ros
+from vn_nav.cli.train import config_over_ros
 from vn_nav.learning.distributed import Processes
 from vn_nav.learning.presets import ENVIRONMENT, preset
 from vn_nav.learning.trainer import Training
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
 HOUSE, ROOMS = 7, 5
 BASE = share_file('config/robots/demo_base.yaml')

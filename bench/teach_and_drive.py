@@ -7,9 +7,9 @@
     python bench/teach_and_drive.py --out teach_and_drive --stage drive --without-ros --seed 7
 
 - **record**: `sim_bridge_node` with a house of the split "unseen look", a camera at another height
-  than the policy's and drifting odometry; a joystick (`vn_sim_bridge.joystick`) that publishes
-  Twist; `recorder_node`. Writes `bag`, `robot.yaml`, `record.json`, a map (`record.png`) and views
-  out of the bag (`views.png`); `vn_nav bag doctor` has to find no error.
+  than the policy's and drifting odometry; a joystick (`vn_sim_bridge.robot.joystick`) that
+  publishes Twist; `recorder_node`. Writes `bag`, `robot.yaml`, `record.json`, a map (`record.png`)
+  and views out of the bag (`views.png`); `vn_nav bag doctor` has to find no error.
 - **teach**: `vn_nav teach` on that bag alone, for so many minutes. Writes `taught`.
 - **drive**: episodes over ROS from random starts to pictures out of the bag, of which
   `ground_truth/odom` says where they were taken: `goals`. Rows: the policy before and after, the
@@ -41,28 +41,29 @@ import yaml
 from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.motion import fill_twist, odometry_to_array
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS, arrived, wrap_angle
-from vn_nav.bags.reader import read_bag
-from vn_nav.cli_world import machine
-from vn_nav.demo import LINE, Processes, ProcessFailure
+from vn_nav.bags.storage.reader import read_bag
+from vn_nav.cli.demo import LINE
+from vn_nav.cli.world import machine
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.evaluation.evaluator import ARRIVAL, DECLARED, STOP_THRESHOLD
 from vn_nav.evaluation.metrics import Episode, summarise
-from vn_nav.evaluation.tables import print_rows
+from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.observation import preprocess
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.report.tables import print_rows
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
-from vn_sim_bridge.backends.house import HouseBackend
-from vn_sim_bridge.env import STOPS
-from vn_sim_bridge.goal_pictures import GoalPicture, load_goal_pictures, save_goal_pictures
-from vn_sim_bridge.houses.contact_sheet import MARGIN, SCALE, house_map
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.viewpoints import VIEW, interest
-from vn_sim_bridge.joystick import Joystick
-from vn_sim_bridge.randomisation import load_randomisation
-from vn_sim_bridge.simulated_robot import TICK, TRUNCATED, SimulatedRobot
+from vn_sim_bridge.navigation.env import STOPS
+from vn_sim_bridge.render.randomisation import load_randomisation
+from vn_sim_bridge.robot.goal_pictures import GoalPicture, load_goal_pictures, save_goal_pictures
+from vn_sim_bridge.robot.joystick import Joystick
+from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
+from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.tools.contact_sheet import MARGIN, SCALE, house_map
 
 STAGES = ('record', 'teach', 'drive')
 BEFORE, AFTER, WRONG, RANDOM = ROWS = ('before', 'after', 'wrong picture', 'random actions')

@@ -3,16 +3,16 @@
 import struct
 import zlib
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import CompressionType, Writer
+from paths import ROOT
 from rosbags.typesys import Stores, get_typestore
 
-FIXTURE = Path(__file__).resolve().parent.parent / 'bags' / 'house_drive'
+FIXTURE = ROOT / 'bags' / 'house_drive'
 STORE = get_typestore(Stores.ROS2_JAZZY)
 MAGIC = b'\x89MCAP0\r\n'
 START = 1_700_000_000_000_000_000  # ns

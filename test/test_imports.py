@@ -5,15 +5,14 @@ import importlib.util
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from paths import ROOT, TESTS
 
-ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 # The leaves that the simulator may use, and what its node shares with the other nodes.
 LEAVES = {'vn_nav.arrival', 'vn_nav.errors', 'vn_nav.goal_picture', 'vn_nav.observation',
-          'vn_nav.overlap', 'vn_nav.resources', 'vn_nav.robot', 'vn_nav.structured_file'}
+          'vn_nav.co_visibility', 'vn_nav.resources', 'vn_nav.robot', 'vn_nav.structured_file'}
 NODE_SHARED = {'vn_nav.nodes.parameters', 'vn_nav.nodes.policy_parameters',
                'vn_nav.nodes.process', 'vn_nav.nodes.qos'}
 
@@ -72,8 +71,8 @@ def test_dependencies(path):
     if not at_the_edge(path):
         assert not {name for name in names if is_ros(name)}, 'ROS is imported away from the edge'
     package = name_of(path).partition('.')[0]
-    if package == 'vn_nav' and not name_of(path).startswith('vn_nav.cli'):
-        assert 'vn_sim_bridge' not in roots(path), 'only vn_nav.cli* compose with the simulator'
+    if package == 'vn_nav' and not name_of(path).startswith('vn_nav.cli.'):
+        assert 'vn_sim_bridge' not in roots(path), 'only vn_nav.cli composes with the simulator'
     if package == 'vn_sim_bridge':
         allowed = LEAVES | (NODE_SHARED if at_the_edge(path) else set())
         used = {name for name in names if name.startswith('vn_nav.')
@@ -114,7 +113,7 @@ def test_the_rest_imports_without_ros(tmp_path):
     names = [name_of(path) for path in SOURCES if not at_the_edge(path)]
     if importlib.util.find_spec('warp') is None:  # an extra: make test-all has it
         names = [name for name in names if '.warp_' not in name]
-    code = BLOCK.format(tests=str(Path(__file__).parent), names=names)
+    code = BLOCK.format(tests=str(TESTS), names=names)
     result = subprocess.run(
         [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True,
         env={**os.environ, 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'})

@@ -3,11 +3,10 @@
 import os
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
+from paths import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 SOURCED = {  # what the set-up of another ROS, or another environment of ROS wheels, leaves behind
     'PYTHONPATH': '/opt/ros/humble/lib/python3.10/site-packages',
     'LD_LIBRARY_PATH': '/opt/ros/humble/lib',

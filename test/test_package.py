@@ -6,13 +6,12 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
 
 import pytest
+from paths import ROOT
 
 import vn_nav
 
-ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = {'vn_nav', 'goal_node', 'policy_node', 'recorder_node', 'sim_bridge_node'}
 
 

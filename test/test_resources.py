@@ -4,14 +4,13 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from paths import ROOT
 
 from vn_nav.errors import UserError
 from vn_nav.resources import share_file
 
-ROOT = Path(__file__).resolve().parent.parent
 ASK = ('from vn_nav.resources import share_file; '
        'print(share_file("config/robots/standard.yaml").read_text())')
 

@@ -6,15 +6,14 @@ a test cannot be renamed or dropped unnoticed; what no other file tests, this on
 
 import ast
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
+from paths import ROOT, TESTS
 
 from vn_nav.learning.presets import ENVIRONMENT
-from vn_sim_bridge.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 
-HERE = Path(__file__).parent
 # Number in thesis-facts.md, section 6; the trap; the tests (of this file: without a file's name).
 TRAPS = {
     1: ('dueling with the mean over one channel', (
@@ -71,7 +70,8 @@ def test_every_trap_has_its_tests():
     for number, (_, names) in TRAPS.items():
         for name in names:
             file, _, function = name.rpartition('::')
-            tree = ast.parse((HERE / (file or Path(__file__).name)).read_text())
+            [path] = TESTS.rglob(file or 'test_traps.py')
+            tree = ast.parse(path.read_text())
             assert function in {node.name for node in tree.body
                                 if isinstance(node, ast.FunctionDef)}, (number, name)
 
@@ -145,10 +145,10 @@ RESIZES = ('resize', 'interpolate', 'grid_sample', 'Upsample')
 # Functions that resize pictures: of cameras, of textures, for people, for frozen features, and to
 # tell a black or frozen camera.
 MAY_RESIZE = {
-    'vn_nav/observation.py', 'vn_sim_bridge/scene.py', 'vn_sim_bridge/houses/textures.py',
-    'vn_sim_bridge/houses/contact_sheet.py', 'vn_sim_bridge/houses/walk.py',
-    'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor.py',
-    'vn_nav/bags/show_figures.py',  # thumbnails for a page
+    'vn_nav/observation.py', 'vn_sim_bridge/render/scene.py', 'vn_sim_bridge/houses/textures.py',
+    'vn_sim_bridge/tools/contact_sheet.py', 'vn_sim_bridge/tools/walk.py',
+    'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor/checks.py',
+    'vn_nav/bags/report/figures.py',  # thumbnails for a page
 }
 
 
@@ -156,11 +156,11 @@ def test_trap_11_labels_are_never_resized():
     """Labels are rendered at the size they are used in; whoever resizes pictures is known."""
     found = set()
     for package in ('vn_nav', 'vn_msgs_py', 'vn_sim_bridge'):
-        for path in (HERE.parent / package).rglob('*.py'):
+        for path in (ROOT / package).rglob('*.py'):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.Attribute) and node.attr in RESIZES and (
                         isinstance(node.value, ast.Name) and node.value.id in ('cv2', 'F')):
-                    found.add(path.relative_to(HERE.parent).as_posix())
+                    found.add(path.relative_to(ROOT).as_posix())
     assert 'vn_nav/observation.py' in found and found <= MAY_RESIZE
     env = make(privileged=('segmentation', 'goal_segmentation'))
     _, info = env.reset(seed=0)

@@ -12,10 +12,11 @@ import numpy as np
 from vn_msgs_py import motion
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
-from vn_sim_bridge import lidar, tasks
-from vn_sim_bridge.odometry import Uncertainty
-from vn_sim_bridge.simulated_robot import TICK, Decision, Episode, SimulatedRobot
-from vn_sim_bridge.world import WORLD_VERSION
+from vn_sim_bridge.floor.contacts import WORLD_VERSION
+from vn_sim_bridge.navigation import tasks
+from vn_sim_bridge.robot import lidar
+from vn_sim_bridge.robot.odometry import Uncertainty
+from vn_sim_bridge.robot.simulated_robot import TICK, Decision, Episode, SimulatedRobot
 
 LIDAR_HEIGHT = 0.2  # m above the floor; the scan is the same at any height
 # What a flat floor fixes: z [m], roll, pitch [rad]. Small, as of a filter for two dimensions.

@@ -36,10 +36,10 @@ from vn_sim_bridge import bridge_messages, bridge_sensors
 from vn_sim_bridge.bridge_messages import Frames
 from vn_sim_bridge.bridge_parameters import PARAMETERS, first_stamp
 from vn_sim_bridge.bridge_sensors import Sensors
-from vn_sim_bridge.goal_pictures import load_goal_pictures
 from vn_sim_bridge.houses.labels import LABELS
-from vn_sim_bridge.randomisation import load_randomisation
-from vn_sim_bridge.simulated_robot import TICK, TRUNCATED, SimulatedRobot
+from vn_sim_bridge.render.randomisation import load_randomisation
+from vn_sim_bridge.robot.goal_pictures import load_goal_pictures
+from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
 
 COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base brakes
 LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base brakes

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from vn_sim_bridge.env import STOPS
-from vn_sim_bridge.simulated_robot import TICK
+from vn_sim_bridge.navigation.env import STOPS
+from vn_sim_bridge.robot.simulated_robot import TICK
 
 DAY = 86_400.0  # s
 # name: (default, meaning, limits), as in `vn_nav.nodes.parameters`.

@@ -13,7 +13,7 @@ import numpy as np
 from vn_msgs_py import camera, images, motion
 from vn_sim_bridge import bridge_messages
 from vn_sim_bridge.bridge_messages import Frames, Transform
-from vn_sim_bridge.simulated_robot import SimulatedRobot
+from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
 
 TOPICS = ('image_raw', 'image_raw/compressed', 'camera_info', 'depth/image_raw',
           'depth/camera_info', 'labels/image_raw', 'scan', 'odom', 'ground_truth/odom')

@@ -71,7 +71,7 @@ def jobs(arguments) -> list[str]:
 
 def hardware(device: str) -> str:
     """The GPU in words, or the processor."""
-    from vn_nav.cli_world import machine
+    from vn_nav.cli.world import machine
     return machine(device)
 
 
@@ -96,8 +96,8 @@ def clear(device: str) -> None:
 
 def device_env(arguments, **options):
     """The environment on the device."""
-    from vn_sim_bridge.env import EnvConfig
-    from vn_sim_bridge.warp_env import WarpNavigationEnv
+    from vn_sim_bridge.navigation.env import EnvConfig
+    from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     return WarpNavigationEnv(EnvConfig(**options), device=arguments.device)
 
 
@@ -121,7 +121,7 @@ def rate(step, frames: int, device: str, seconds: float) -> list[float]:
 
 def agreement(arguments) -> dict:
     """How far the device's pictures are from the Numba renderer's, on the same episodes."""
-    from vn_sim_bridge.env import EnvConfig, NavigationEnv
+    from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
     config = {'houses': (1, 2, 3), 'rooms': 6, 'num_envs': 48}
     host, other = NavigationEnv(EnvConfig(**config)), device_env(arguments, **config)
     host.reset(seed=0)

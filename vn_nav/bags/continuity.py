@@ -17,7 +17,7 @@ from vn_msgs_py.motion import MotionError, odometry_to_array
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.drive import JUMP, JUMP_SPEED
 from vn_nav.bags.stamped import WAIT, set_back
-from vn_nav.bags.stream import messages
+from vn_nav.bags.storage.stream import messages
 
 # Beside JUMP and JUMP_SPEED: faster turns than any robot's, and what a correction may do at once.
 TURN_JUMP, TURN_SPEED = math.radians(45), 2 * math.pi  # rad, rad/s

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
-from vn_nav.bags.bag_files import files_of
 from vn_nav.bags.drive import MISFIT, Cutter, Frame, Report, Step, find_topics, hear, synchronise
 from vn_nav.bags.roles import Topics
-from vn_nav.bags.stream import messages, summary
+from vn_nav.bags.storage.bag_files import files_of
+from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
 from vn_nav.robot import RobotSpec

@@ -23,7 +23,7 @@ from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.stamped import GAP, WAIT, Stamped, set_back
-from vn_nav.bags.stream import messages, summary
+from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.robot import RobotSpec
 
 COMMAND_LASTS = 0.5  # s that a velocity is believed without a new one, as bases do

@@ -1,1 +1,1 @@
-"""Evaluation: episodes, figures and reports."""
+"""Evaluation: episodes and their figures."""

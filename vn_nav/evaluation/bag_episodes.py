@@ -17,7 +17,7 @@ import numpy as np
 
 from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.motion import odometry_to_array
-from vn_nav.bags.reader import read_bag
+from vn_nav.bags.storage.reader import read_bag
 from vn_nav.errors import UserError
 from vn_nav.evaluation.metrics import Episode
 

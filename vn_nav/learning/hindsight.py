@@ -14,9 +14,9 @@ import numpy as np
 
 from vn_nav.arrival import arrived, heading_error
 from vn_nav.bags.drive import MISFIT
+from vn_nav.co_visibility import lift, overlap, overlap_by_poses, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.learning.auxiliary import MAX_DEPTH
-from vn_nav.overlap import lift, overlap, overlap_by_poses, relative_pose
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ Span = tuple[int, int]  # first row of an episode, and the row after its last
 class Labels(NamedTuple):
     """What relates K rows to their goals."""
 
-    goal_pose: np.ndarray  # [K,4] float32, see `vn_nav.overlap.relative_pose`
+    goal_pose: np.ndarray  # [K,4] float32, see `vn_nav.co_visibility.relative_pose`
     arrived: np.ndarray  # [K] bool, by the image task's rule on the straight distance
     distance: np.ndarray  # [K] float32 m along the drive
 

@@ -26,7 +26,7 @@ SEED = 1  # of the spots
 
 
 class Views(Protocol):
-    """Pictures of a place with their poses; `vn_sim_bridge.graph_views.GraphViews` is one."""
+    """Pictures of a place with their poses; the simulator's `GraphViews` is one."""
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """The next pictures [K,3,S,S] uint8 and poses [K,3] x, y [m], yaw [rad]."""

@@ -76,11 +76,11 @@ class Collector:
     """Acts in an environment by sampling, and keeps both their states between rollouts.
 
     Everything lives on the network's device. Of an environment on that device (its `goals` are a
-    tensor, as `vn_sim_bridge.warp_env.WarpNavigationEnv`'s are) nothing passes through the host
+    tensor, as `WarpNavigationEnv`'s are) nothing passes through the host
     while it acts, and the host waits for the device once a rollout, to read the episodes.
 
     Args:
-        env: a vector environment that observes as `vn_sim_bridge.env.NavigationEnv` does; tensors
+        env: a vector environment that observes as `NavigationEnv` does; tensors
             may change in place with its next step.
         network: the policy; it acts in its `compute_dtype`.
         generator: source of the sampled actions, on the network's device.

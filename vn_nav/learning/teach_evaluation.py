@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vn_nav.evaluation import evaluator, tables
-from vn_nav.evaluation.evaluation_page import evaluation_page
+from vn_nav.evaluation import evaluator
 from vn_nav.files import write_file
 from vn_nav.learning.stages import Stages
 from vn_nav.policy.network import Policy
+from vn_nav.report import tables
+from vn_nav.report.evaluation_page import evaluation_page
 from vn_nav.robot import RobotSpec
 
 BEFORE = 'before teaching'

@@ -60,9 +60,9 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
     memories fill anew.
 
     Args:
-        env: a vector environment as `vn_sim_bridge.env.NavigationEnv`: `num_envs`, `goals`,
+        env: a vector environment as `vn_sim_bridge`'s `NavigationEnv`: `num_envs`, `goals`,
             `action_names`, `world_version`, `set_difficulty`, NEXT_STEP autoreset; or one whose
-            rows are tensors on `config.device`, as `vn_sim_bridge.warp_env.WarpNavigationEnv`.
+            rows are tensors on `config.device`, as its `WarpNavigationEnv`.
         config: numbers of the training.
         folder: new or empty of an earlier training, unless `resume`.
         resume: go on from the folder's last save.

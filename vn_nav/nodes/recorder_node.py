@@ -19,9 +19,9 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from vn_msgs_py.topics import BEST_EFFORT, LATCHED, TOPICS, VOLATILE, Topic, topic
-from vn_nav.bags.definitions import definition
-from vn_nav.bags.losses import Losses
-from vn_nav.bags.recorder import MIN_FREE, BagWriter, RecordingStopped
+from vn_nav.bags.storage.definitions import definition
+from vn_nav.bags.storage.losses import Losses
+from vn_nav.bags.storage.writer import MIN_FREE, BagWriter, RecordingStopped
 from vn_nav.errors import UserError
 from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.process import Ended, run_node

@@ -30,7 +30,7 @@ GOALS = 1024  # different goal pictures of a training
 class RosEnv:
     """Visual navigation of real robots, or of simulated ones behind topics; used as a context.
 
-    It observes and tells as `vn_sim_bridge.env.NavigationEnv` does, as far as topics know:
+    It observes and tells as `vn_sim_bridge`'s `NavigationEnv` does, as far as topics know:
     `info` has `reset`, `success`, `collided`, `arrived` and, where they are published and asked
     for, `depth` and `segmentation`. An episode ends as `episode_end` says; with a reward above 0,
     or `arrived`; where nobody publishes `episode_end` after `max_decisions`; with another

@@ -33,8 +33,8 @@ from std_srvs.srv import Trigger
 
 from vn_msgs_py import images
 from vn_msgs_py.topics import VOLATILE, topic
-from vn_nav.bags.recorder import BagWriter, RecordingStopped
 from vn_nav.bags.stamped import WINDOW
+from vn_nav.bags.storage.writer import BagWriter, RecordingStopped
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.command_output import CommandOutput

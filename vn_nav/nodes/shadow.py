@@ -40,12 +40,12 @@ from std_srvs.srv import SetBool
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import twist_to_array
 from vn_msgs_py.topics import Topic, topic
-from vn_nav.bags.recorder import BagWriter
-from vn_nav.bags.shadow_plan import RESOLUTION, Decision, Event, Plan, stamped
-from vn_nav.demo import Processes, ProcessFailure
+from vn_nav.bags.shadow.plan import RESOLUTION, Decision, Event, Plan, stamped
+from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
 from vn_nav.nodes.policy_node import SHADOW_LIMIT
 from vn_nav.nodes.process import Ended
+from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.nodes.qos import qos
 
 DOMAINS = range(215, 233)  # beyond those that people choose; they leave Linux's ports alone

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from vn_sim_bridge.houses.layout import Rect
-from vn_sim_bridge.scene import Scene
+from vn_sim_bridge.render.scene import Scene
 
 CELL = 0.1  # m, side of a cell of the floor map
 FAR = 1e9  # cells: not reached
@@ -75,7 +75,7 @@ class House:
         return DistanceField(self.floor, x, y)
 
     def starts(self) -> tuple[np.ndarray, None]:
-        """Where episodes may begin, see `backends.base.Place`: anywhere, facing anywhere."""
+        """Where episodes may begin, see `simulator.Place`: anywhere, facing anywhere."""
         return self.floor.centres(), None
 
     def room_at(self, x: float, y: float) -> str:

@@ -14,7 +14,7 @@ from vn_sim_bridge.houses.gltf import read_gltf
 from vn_sim_bridge.houses.labels import LABEL, LABELS
 from vn_sim_bridge.houses.obj import read_obj
 from vn_sim_bridge.houses.surface import MAX_TRIANGLES, Part
-from vn_sim_bridge.scene import Scene, TextureSet, uniform_light
+from vn_sim_bridge.render.scene import Scene, TextureSet, uniform_light
 
 GROUP = 64  # triangles culled together
 READERS = {'.obj': read_obj, '.glb': read_gltf, '.gltf': read_gltf}

@@ -12,7 +12,7 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.surface import linear_from_srgb
-from vn_sim_bridge.scene import Scene, TextureSet
+from vn_sim_bridge.render.scene import Scene, TextureSet
 
 FLOAT, INDEX = 5126, 5125  # component types
 

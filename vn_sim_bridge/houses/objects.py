@@ -10,7 +10,7 @@ from vn_nav.errors import UserError
 from vn_sim_bridge.houses.looks import STANDARD
 from vn_sim_bridge.houses.piece import Piece
 from vn_sim_bridge.houses.textures import texture_library
-from vn_sim_bridge.scene import Scene, SceneBuilder
+from vn_sim_bridge.render.scene import Scene, SceneBuilder
 
 
 def _ball(p):

@@ -13,7 +13,7 @@ import numpy as np
 from vn_sim_bridge.houses.labels import LABEL
 from vn_sim_bridge.houses.looks import Look
 from vn_sim_bridge.houses.textures import TEXTURES
-from vn_sim_bridge.scene import SceneBuilder
+from vn_sim_bridge.render.scene import SceneBuilder
 
 
 class Piece:

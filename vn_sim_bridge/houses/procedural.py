@@ -34,7 +34,7 @@ from vn_sim_bridge.houses.piece import Piece
 from vn_sim_bridge.houses.splits import look_of
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
 from vn_sim_bridge.houses.viewpoints import choose_goals
-from vn_sim_bridge.scene import SceneBuilder
+from vn_sim_bridge.render.scene import SceneBuilder
 
 HEIGHT = 2.6  # m, of rooms
 DOOR_HEIGHT = 2.05  # m

@@ -10,7 +10,7 @@ import functools
 import cv2
 import numpy as np
 
-from vn_sim_bridge.scene import TextureSet
+from vn_sim_bridge.render.scene import TextureSet
 
 _SIZE = 64  # texels a side
 PAINTINGS = 32  # distinct pictures for walls

@@ -8,7 +8,7 @@ import numpy as np
 
 from vn_sim_bridge.houses.house import FloorMap, Room
 from vn_sim_bridge.render.rasterizer import Rasterizer
-from vn_sim_bridge.scene import Scene
+from vn_sim_bridge.render.scene import Scene
 
 CAMERA_HEIGHT = 1.0  # m, the standard robot
 FIELD_OF_VIEW = math.radians(90)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.scene import MAX_CORNERS, Scene
+from vn_sim_bridge.render.scene import MAX_CORNERS, Scene
 
 CLUSTER = 16  # groups whose common box is tested first
 EMPTY = np.int32(2**31 - 1)  # index of the polygon where there is none

@@ -29,7 +29,7 @@ from vn_sim_bridge.render.pack import (
     pack_scenes,
     standard_lights,
 )
-from vn_sim_bridge.scene import MAX_CORNERS, MAX_LIGHT_NODES, Scene
+from vn_sim_bridge.render.scene import MAX_CORNERS, MAX_LIGHT_NODES, Scene
 
 NEAR = 0.03  # m, near plane
 TILE = 8  # pixels a side, of the coarse depth that hides groups

@@ -1,0 +1,407 @@
+"""Bags that are written here: what is in them, what other readers say, what a full disk leaves."""
+
+import shutil
+import subprocess
+import sys
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from faults import no_file_beyond
+from foreign_readers import assert_every_reader_accepts, information
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Chunk, Message
+from mcap.stream_reader import StreamReader
+from paths import ROOT
+from rosbags.highlevel import AnyReader
+
+from vn_msgs_py.topics import TOPICS, Topic, topic
+from vn_nav.bags.storage.definitions import definition
+from vn_nav.bags.storage.losses import Losses
+from vn_nav.bags.storage.output import CHUNK, McapOutput
+from vn_nav.bags.storage.reader import read_bag
+from vn_nav.bags.storage.stream import Bag
+from vn_nav.bags.storage.writer import BagWriter, RecordingStopped
+from vn_nav.errors import UserError
+from vn_nav.evaluation.bag_episodes import drives_from_bag
+
+HERE = Path(__file__).parent
+BAGS = ROOT / 'bags'
+FIXTURE = BAGS / 'house_drive'
+FIXTURES = sorted(path.parent.name for path in BAGS.glob('*/metadata.yaml'))
+TEXT = topic('scene')  # a string: as large as one likes
+START = 1_800_000_000_000_000_000  # ns
+
+
+def text(size, seed=0):
+    """A CDR string that does not compress."""
+    content = np.random.default_rng(seed).integers(32, 127, size, np.uint8).tobytes()
+    return b'\0\1\0\0' + (size + 1).to_bytes(4, 'little') + content + b'\0'
+
+
+def read_linearly(path):
+    """The messages of a file that may have no end."""
+    records = []
+    try:
+        with open(path, 'rb') as file:
+            for record in StreamReader(file, validate_crcs=True).records:
+                if isinstance(record, Message):
+                    records.append(record)
+    except McapError:
+        pass
+    return records
+
+
+@pytest.mark.parametrize('name', FIXTURES)
+def test_the_fixtures_are_small_and_every_reader_counts_the_same(name):
+    folder = BAGS / name
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 1_000_000
+    told = information(folder)
+    assert told['version'] == 9 and told['storage_identifier'] == 'mcap'
+    ours = sum(1 for _ in read_bag(folder))
+    with AnyReader([folder]) as reader:
+        assert reader.message_count == ours == told['message_count'] > 0
+    with open(folder / told['relative_file_paths'][0], 'rb') as file:
+        assert sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages()) == ours
+
+
+def test_an_episode_comes_out_of_the_drive():
+    drive, = drives_from_bag(FIXTURE, pictures=True)
+    recorded, = drive.episodes
+    assert drive.scene['house'] == 7 and recorded.episode.decisions == 10
+    assert not recorded.episode.success and recorded.episode.path_length > 0.5
+    assert recorded.goal_picture.shape == (84, 84, 3)
+    assert len(recorded.pictures) >= 10
+    assert np.isfinite(recorded.trajectory).all()
+
+
+def test_a_bag_without_the_bridges_topics_or_with_damage_is_one_error(tmp_path):
+    with pytest.raises(UserError, match='metadata.yaml'):
+        drives_from_bag(tmp_path)
+    broken = tmp_path / 'broken'
+    broken.mkdir()
+    (broken / 'metadata.yaml').write_text((FIXTURE / 'metadata.yaml').read_text())
+    file, = FIXTURE.glob('*.mcap')
+    (broken / file.name).write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    with pytest.raises(UserError, match='readable'):
+        list(read_bag(broken))
+
+
+# Writing.
+
+
+def test_what_is_written_again_is_the_same_and_every_reader_accepts_it(tmp_path):
+    """All messages of the drive through the writer, split into files."""
+    names = {f'/{entry.name.lstrip("/")}': entry.name for entry in TOPICS}
+    with AnyReader([FIXTURE]) as reader:
+        before = [(connection.topic, stamp, bytes(data))
+                  for connection, stamp, data in reader.messages()]
+    with BagWriter(tmp_path / 'bag', TOPICS, max_bytes=60_000) as bag:
+        for number, (name, stamp, data) in enumerate(before):
+            bag.write(names[name], data, stamp, number + 1)
+    assert bag.written.total() == len(before)
+    assert_every_reader_accepts(tmp_path / 'bag')
+    with AnyReader([tmp_path / 'bag']) as reader:
+        after = [(connection.topic, stamp, bytes(data))
+                 for connection, stamp, data in reader.messages()]
+    assert after == before
+    told = information(tmp_path / 'bag')
+    count = len(told['files'])
+    assert told['relative_file_paths'] == [f'bag_{k}.mcap' for k in range(count)] and count > 2
+    assert sum(file['message_count'] for file in told['files']) == len(before)
+    assert told['starting_time']['nanoseconds_since_epoch'] == before[0][1]
+    assert told['duration']['nanoseconds'] == before[-1][1] - before[0][1]
+    sizes = [(tmp_path / 'bag' / name).stat().st_size for name in told['relative_file_paths']]
+    assert max(sizes[:-1]) < 60_000 + CHUNK + 20_000  # the last chunk, and the summary
+
+
+def test_definitions_and_quality_of_service_are_as_rosbag2_has_them(tmp_path):
+    with BagWriter(tmp_path / 'bag', [topic('goal_image'), TEXT]) as bag:
+        bag.write('scene', text(10), START)
+    told = information(tmp_path / 'bag')['topics_with_message_count']
+    assert [entry['message_count'] for entry in told] == [1]  # nothing of the other topic
+    facts = told[0]['topic_metadata']
+    quality, = facts['offered_qos_profiles']
+    assert facts['type_description_hash'].startswith('RIHS01_')
+    assert (quality['durability'], quality['reliability'], quality['depth']) == (
+        'transient_local', 'reliable', 1)
+    # A duration without end, as Jazzy has it (bags/ros2_bag_record was recorded by it).
+    jazzy = information(BAGS / 'ros2_bag_record')['topics_with_message_count'][0]
+    forever = jazzy['topic_metadata']['offered_qos_profiles'][0]['deadline']
+    assert quality['deadline'] == quality['lifespan'] == forever
+    assert quality['liveliness_lease_duration'] == forever
+    with open(tmp_path / 'bag' / 'bag_0.mcap', 'rb') as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+    channel, = summary.channels.values()
+    schema, = summary.schemas.values()
+    assert (channel.topic, channel.message_encoding) == ('/scene', 'cdr')
+    assert (schema.name, schema.encoding) == ('std_msgs/msg/String', 'ros2msg')
+    assert yaml.safe_load(channel.metadata['offered_qos_profiles']) == [quality]
+
+
+def test_a_type_of_a_package_installed_here_is_written_with_all_it_is_made_of(
+        tmp_path, monkeypatch):
+    folder = tmp_path / 'prefix' / 'share' / 'bench_msgs' / 'msg'
+    folder.mkdir(parents=True)
+    (folder / 'Thing.msg').write_text('std_msgs/Header header\nPart[] parts  # of it\n')
+    (folder / 'Part.msg').write_text('uint8 NONE=0\nfloat32[3] size\n')
+    (folder / 'Bad.msg').write_text('float32[ size\n')
+    with pytest.raises(UserError, match='installed'):
+        definition('bench_msgs/msg/Thing')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path / 'prefix'))
+    words, digest = definition('bench_msgs/msg/Thing')
+    assert 'MSG: bench_msgs/Part' in words and 'MSG: builtin_interfaces/Time' in words
+    assert digest.startswith('RIHS01_')
+    with pytest.raises(UserError, match='Bad'):
+        definition('bench_msgs/msg/Bad')
+    with pytest.raises(UserError, match='installed'):
+        BagWriter(tmp_path / 'bag', [Topic('a', 'nobody_msgs/msg/A', '', '')])
+    assert not (tmp_path / 'bag').exists()
+
+
+def test_a_chunk_is_256_kib_or_one_message_and_all_but_the_last_are_in_the_file(tmp_path):
+    """At every moment: what a killed recorder loses is the chunk that is being filled."""
+    path = tmp_path / 'file.mcap'
+    output = McapOutput(path)
+    channel = output.channel('/scene', TEXT.type, definition(TEXT.type)[0], {})
+    sizes = [20_000] * 40 + [400_000, 100, 300_000, 262_000] + [90_000] * 9
+    for number, size in enumerate(sizes):
+        output.add(channel, text(size, number), START + number, number + 1)
+        kept = len(read_linearly(path))
+        assert sum(size + 40 for size in sizes[kept:number + 1]) <= CHUNK
+    output.flush()
+    output.finish()
+    assert len(read_linearly(path)) == len(sizes)
+    with open(path, 'rb') as file:
+        chunks = [record for record in StreamReader(file, emit_chunks=True).records
+                  if isinstance(record, Chunk)]
+    assert {chunk.compression for chunk in chunks} == {'zstd'}
+    assert all(chunk.uncompressed_crc for chunk in chunks)
+    assert all(chunk.uncompressed_size <= CHUNK or chunk.message_start_time
+               == chunk.message_end_time for chunk in chunks)
+
+
+def test_every_second_what_has_come_is_in_the_file_and_the_folder_is_a_bag(tmp_path):
+    with BagWriter(tmp_path / 'bag', [TEXT]) as bag:
+        assert information(tmp_path / 'bag')['relative_file_paths'] == ['bag_0.mcap']
+        begun = time.monotonic()
+        bag.write('scene', text(100), START)
+        while not read_linearly(tmp_path / 'bag' / 'bag_0.mcap'):
+            assert time.monotonic() < begun + 20
+            time.sleep(0.05)
+        assert not bag.stopped
+
+
+RECORDING = """
+import sys, time
+sys.path[:0] = [sys.argv[1], sys.argv[1] + '/..']
+from test_bags import START, TEXT, BagWriter, text, topic
+bag = BagWriter(sys.argv[2], [TEXT, topic('reward')])
+for number in range(10**9):
+    bag.write('scene', text(1000, number), START + number)
+    if number == 100:
+        bag.write('reward', bytes(8), START + number)
+    time.sleep(0.005)
+"""
+
+
+@pytest.mark.slow
+def test_of_a_killed_recording_the_metadata_says_what_is_in_it(tmp_path):
+    """`ros2 bag play` believes it: topics, counts and times, at most a second old."""
+    process = subprocess.Popen([sys.executable, '-c', RECORDING, str(HERE),
+                                str(tmp_path / 'bag')])
+    path, end = tmp_path / 'bag' / 'metadata.yaml', time.monotonic() + 60
+    try:
+        while not path.exists() or len(
+                information(tmp_path / 'bag')['topics_with_message_count']) < 2:
+            assert time.monotonic() < end and process.poll() is None
+            time.sleep(0.02)
+        time.sleep(1.5)
+    finally:
+        process.kill()
+        process.wait()
+    there = read_linearly(tmp_path / 'bag' / 'bag_0.mcap')
+    told = information(tmp_path / 'bag')
+    counts = {entry['topic_metadata']['name']: entry['message_count']
+              for entry in told['topics_with_message_count']}
+    assert counts['/reward'] == 1
+    assert 100 < sum(counts.values()) == told['message_count'] <= len(there)
+    assert told['files'][0]['message_count'] == told['message_count']
+    last = START + told['duration']['nanoseconds']
+    assert last == there[told['message_count'] - 1].log_time
+    assert [p.name for p in sorted((tmp_path / 'bag').iterdir()) if p.suffix != '.tmp'] == [
+        'bag_0.mcap', 'metadata.yaml']
+
+
+def chunk_by_chunk(path, count, look=lambda k: None):
+    """A file with a message a chunk, not finished."""
+    output = McapOutput(path)
+    channel = output.channel('/scene', TEXT.type, definition(TEXT.type)[0], {})
+    for k in range(count):
+        output.add(channel, text(10), START + k, k)
+        output.flush()
+        look(k)
+    return output
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_recorder_does_not_grow_with_its_chunks(tmp_path):
+    """800 bytes a chunk would be 175 MB an hour; the index is whole nevertheless."""
+    taken = {}
+
+    def look(k):
+        if k in (3000, 12_999):
+            taken[k] = tracemalloc.get_traced_memory()[0]
+    tracemalloc.start()
+    try:
+        output = chunk_by_chunk(tmp_path / 'a.mcap', 13_000, look)
+    finally:
+        tracemalloc.stop()
+    assert abs(taken[12_999] - taken[3000]) < 60 * 10_000
+    output.finish()
+    assert [path.name for path in tmp_path.iterdir()] == ['a.mcap']
+    with open(tmp_path / 'a.mcap', 'rb') as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert len(reader.get_summary().chunk_indexes) == 13_000
+        assert reader.get_summary().statistics.message_count == 13_000
+    assert [m.sequence for m in Bag(tmp_path / 'a.mcap').messages()] == list(range(13_000))
+
+
+@pytest.mark.slow
+def test_chunks_that_are_no_longer_in_memory_are_given_up_as_well(tmp_path):
+    """Where the summary of 5,000 small chunks needs the place of thousands."""
+    output = chunk_by_chunk(tmp_path / 'a.mcap', 5000)
+    with no_file_beyond(output.size + 1000):
+        output.finish()
+    numbers = [m.sequence for m in Bag(tmp_path / 'a.mcap').messages()]
+    assert numbers == list(range(len(numbers))) and 1000 < len(numbers) < 4000
+
+
+@pytest.mark.slow  # it waits for the time to pass
+def test_files_are_split_by_time(tmp_path):
+    count, end = 0, time.monotonic() + 30
+    with BagWriter(tmp_path / 'bag', [TEXT], max_seconds=0.2) as bag:
+        # The clock of a split is the writing thread's, which a busy machine holds up at will.
+        while len(list((tmp_path / 'bag').glob('*.mcap'))) < 4 and time.monotonic() < end:
+            bag.write('scene', text(10), START + count)
+            count += 1
+            time.sleep(0.05)
+    facts = information(tmp_path / 'bag')
+    assert len(facts['files']) >= 4
+    assert facts['message_count'] == count
+    assert all(file['message_count'] for file in facts['files'])
+    assert_every_reader_accepts(tmp_path / 'bag')
+
+
+def test_an_empty_recording_is_a_bag(tmp_path):
+    BagWriter(tmp_path / 'bag', TOPICS).close()
+    assert_every_reader_accepts(tmp_path / 'bag')
+    assert list(read_bag(tmp_path / 'bag')) == []
+
+
+def test_a_stamp_that_is_none_is_refused_where_it_is_given(tmp_path):
+    with BagWriter(tmp_path / 'bag', [TEXT]) as bag:
+        with pytest.raises(ValueError, match='1970'):
+            bag.write('scene', text(10), -1)
+        bag.write('scene', text(10), START)
+    assert information(tmp_path / 'bag')['message_count'] == 1
+
+
+# Full disks.
+
+
+def write_until_it_stops(bag, count=2000):
+    """Pieces of 20 kB; how many were taken."""
+    for number in range(count):
+        try:
+            bag.write('scene', text(20_000, number), START + number, number + 1)
+        except RecordingStopped as error:
+            assert 'whole' in str(error)
+            return number
+    raise AssertionError(f'{count} pieces fitted')
+
+
+def assert_whole_from_the_first(folder, least):
+    """Every reader accepts it, and it holds the first messages without a gap."""
+    assert_every_reader_accepts(folder)
+    with open(folder / f'{folder.name}_0.mcap', 'rb') as file:
+        numbers = [message.sequence for _, _, message in make_reader(file).iter_messages()]
+    assert numbers == list(range(1, len(numbers) + 1)) and len(numbers) >= least
+
+
+def test_a_disk_that_fails_a_write_leaves_a_whole_bag(tmp_path):
+    with no_file_beyond(2_000_000):
+        bag = BagWriter(tmp_path / 'bag', [TEXT])
+        taken = write_until_it_stops(bag)
+        with pytest.raises(RecordingStopped, match='File too large'):
+            bag.close()
+    # Twelve messages a chunk: one did not fit, one or two made room for the summary.
+    assert_whole_from_the_first(tmp_path / 'bag', 2_000_000 // 20_000 - 4 * 13)
+    assert bag.written.total() == information(tmp_path / 'bag')['message_count'] < taken
+
+
+def test_no_bag_is_begun_without_room(tmp_path):
+    with pytest.raises(UserError, match='GB free'):
+        BagWriter(tmp_path / 'bag', [TEXT], min_free=1 << 50)
+    assert not (tmp_path / 'bag').exists()
+
+
+FULL_DISK = """
+import os, sys
+sys.path[:0] = [sys.argv[1], sys.argv[1] + '/..']
+from test_bags import TEXT, BagWriter, RecordingStopped, write_until_it_stops
+disk, reserve = sys.argv[2], int(sys.argv[3])
+bag = BagWriter(disk + '/bag', [TEXT], min_free=reserve)
+write_until_it_stops(bag)
+try:
+    bag.close()
+except RecordingStopped as error:
+    print(error.received)
+facts = os.statvfs(disk)
+print(facts.f_bavail * facts.f_frsize)
+"""
+
+
+@pytest.mark.parametrize('reserve', [0, 3_000_000])
+def test_a_full_disk_and_one_below_the_limit_leave_a_whole_bag(reserve, tmp_path):
+    spaces = [['unshare', own] for own in ('-m', '-rm')]
+    probe = ['sh', '-c', f'mount -t tmpfs tmpfs {tmp_path}']
+    inside = next((space for space in spaces if shutil.which('unshare') and subprocess.run(
+        [*space, *probe], capture_output=True).returncode == 0), None)
+    if inside is None:
+        pytest.skip('expected: this machine lets nobody mount a small disk')
+    (tmp_path / 'disk').mkdir()
+    (tmp_path / 'script.py').write_text(FULL_DISK)
+    done = subprocess.run(
+        [*inside, 'sh', '-c', 'mount -t tmpfs -o size=8m tmpfs "$1/disk" && '
+         '"$2" "$1/script.py" "$3" "$1/disk" "$4" && cp -a "$1/disk/bag" "$1/bag"', 'sh',
+         tmp_path, sys.executable, HERE, str(reserve)],
+        capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr[-2000:]
+    reason, free = done.stdout.splitlines()
+    assert ('GB free' if reserve else 'No space left on device') in reason
+    assert int(free) > reserve - CHUNK - 100_000
+    least = (8 * 2**20 - reserve) // 20_100 - 5 * 13
+    assert_whole_from_the_first(tmp_path / 'bag', least)
+
+
+# Losses.
+
+
+def test_losses_are_counted_between_the_numbers_of_publishers():
+    def lost(numbers, publishers=1):
+        losses = Losses()
+        return sum(losses.hear(number, publishers) for number in numbers)
+    assert lost(range(5, 100)) == 0, "what was before the first is nobody's loss"
+    assert lost([1, 2, 5, 6, 10]) == 5
+    assert lost([7, 8, 9, 1, 2, 3, 5]) == 1, 'a publisher that was started again'
+    assert lost([7, 8, 1, 9, 2, 10, 3], 2) == 0
+    assert lost([7, 8, 1, 9, 2, 10, 3], 1) == 0, 'before the graph shows the second publisher'
+    assert lost([7, 8, 1, 9, 2, 12, 3], 2) == 2
+    assert lost([1, 1, 2, 2, 3, 3], 2) == 0

@@ -1,0 +1,192 @@
+"""Episodes of a policy and its controls, by kind of stop and by house, and the page about them."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from vn_nav.evaluation.evaluator import (
+    PolicyActor,
+    by_scene,
+    figures,
+    measure,
+    random_actor,
+    run_episodes,
+)
+from vn_nav.evaluation.metrics import Episode
+from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.report.evaluation_page import choose, evaluation_page, outcome
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+
+ROWS = ['right goal, sample', 'right goal, greedy', 'wrong goal', 'blank goal', 'random actions',
+        'shortest path']
+
+
+def make_network(**fields):
+    torch.manual_seed(0)
+    return Policy(NetworkConfig(**{'actions': DRIVE_ACTIONS, 'size': 36, 'channels': (4, 4, 4),
+                                   'features': 16, 'hidden': 16} | fields))
+
+
+def make_env(houses=(7,), environments=6, stop='arrival', *, limit=40):
+    return NavigationEnv(EnvConfig(houses=tuple(houses), num_envs=environments, size=36,
+                                   max_decisions=limit, stop=stop))
+
+
+def oracle(env):
+    return lambda observation, reset: env.oracle_actions()
+
+
+def test_every_environment_gives_the_same_number_of_episodes():
+    env = make_env()
+    episodes = run_episodes(env, random_actor(env, 0), 12, seed=1, robot=RobotSpec())
+    again = run_episodes(env, random_actor(env, 0), 12, seed=1, robot=RobotSpec())
+    assert len(episodes) == 12 and episodes == again
+    for one in episodes:
+        assert one.start_distance >= 1.0 and 1 <= one.decisions <= 40
+        assert one.collisions <= one.decisions and one.reward == float(one.success)
+        assert one.seconds > 0.5 * one.decisions
+        assert one.scene == 7 and one.declared is None and one.reached == one.success
+
+
+def test_trajectories_are_the_episodes():
+    """Start, every decision's end, the metres driven and the goal: as the figures say."""
+    env = make_env(limit=80)
+    for one in run_episodes(env, oracle(env), 12, seed=3, robot=RobotSpec()):
+        assert len(one.trajectory) == one.decisions + 1
+        driven = np.hypot(*np.diff(one.trajectory[:, :2], axis=0).T).sum()
+        assert driven == pytest.approx(one.path_length, abs=1e-4)
+        assert len(one.contacts) == one.collisions
+        assert one.success
+        assert np.hypot(*(one.trajectory[-1, :2] - one.goal_pose[:2])) <= 0.6
+        house = env.houses[0]
+        assert house.room_at(*one.goal_pose[:2]) == one.goal
+        field = house.geodesic(*one.goal_pose[:2])
+        start = field.distance(one.trajectory[:1, :2])[0]
+        assert start == pytest.approx(one.start_distance, abs=1e-3)
+
+
+def test_every_control_and_equal_starts():
+    rows = measure(functools.partial(make_env, limit=60), make_network(), [7], decoding='sample',
+                   episodes=10)
+    assert list(rows) == ['arrival'] and list(rows['arrival']) == ROWS
+    found = figures(rows)['arrival']
+    assert found['shortest path']['success'] >= 0.9
+    starts = {tuple(e.start_distance for e in episodes) for episodes in rows['arrival'].values()}
+    assert len(starts) == 1
+
+
+def test_houses_add_up_to_the_total():
+    houses = [7, 8, 10_000]
+    rows = measure(functools.partial(make_env, limit=50), make_network(), houses,
+                   decoding='sample', episodes=10, controls=('shortest path',))
+    total = figures(rows)['arrival']
+    scenes = {seed: figures(own)['arrival'] for seed, own in by_scene(rows).items()}
+    assert sorted(scenes) == houses
+    for name, whole in total.items():
+        parts = [own[name] for own in scenes.values()]
+        assert [part['episodes'] for part in parts] == [4, 4, 4] and whole['episodes'] == 12
+        for key in ('success', 'spl', 'contact_free_success', 'stop_error_m', 'decisions',
+                    'seconds', 'return'):
+            assert np.mean([part[key] for part in parts]) == pytest.approx(whole[key]), key
+        touched = sum(part['collisions'] * part['decisions'] for part in parts)
+        assert touched / sum(part['decisions'] for part in parts) == pytest.approx(
+            whole['collisions'])
+
+
+def test_many_houses_are_measured_in_parts(monkeypatch):
+    """As if they were in memory at once, except for the seeds of the later parts."""
+    made = []
+
+    def make(houses, environments, stop):
+        made.append((houses, environments))
+        return make_env(houses, environments, stop, limit=10)
+    monkeypatch.setattr('vn_nav.evaluation.evaluator.HOUSES_AT_ONCE', 2)
+    rows = measure(make, make_network(), [7, 8, 9], decoding='greedy', episodes=5, controls=())
+    assert made == [([7, 8], 4), ([9], 2)]
+    episodes = rows['arrival']['right goal, greedy']
+    assert sorted(e.scene for e in episodes) == [7, 7, 8, 8, 9, 9]
+
+
+def test_a_declared_stop_is_measured_beside_arrival():
+    network = make_network(heads=('arrival',))
+    rows = measure(make_env, network, [7], decoding='sample', episodes=6, threshold=0.0)
+    assert list(rows) == ['arrival', 'declared'] and list(rows['declared']) == ROWS
+    # Above 0 is every probability: the policy declares at once, and is wrong, a metre off or more.
+    found = figures(rows)['declared']
+    policy = found['right goal, sample']
+    assert policy['false_stops'] == policy['declared'] == 1.0 and policy['success'] == 0.0
+    assert policy['decisions'] == 1.0 and policy['seconds'] == 0.0
+    assert found['shortest path']['success'] >= 0.9
+    assert found['shortest path']['false_stops'] == 0.0
+    # Below 1 is every one: it never declares, and nothing ends before the limit.
+    never = figures(measure(make_env, network, [7], decoding='sample', episodes=6,
+                            controls=(), threshold=0.999))['declared']['right goal, sample']
+    assert never['declared'] == never['false_stops'] == never['success'] == 0.0
+    assert never['decisions'] == 40
+
+
+def test_the_policy_declares_where_its_head_says_so():
+    env = make_env(stop='declared')
+    actor = PolicyActor(env, make_network(heads=('arrival',)), 'sample', 0, threshold=0.5)
+    observation, info = env.reset(seed=0)
+    actions = actor(observation, info['reset'])
+    actor.threshold = float(np.median(actor.policy.arrival))
+    actions = actor(observation, info['reset'])
+    declared = actions == env.declare_action
+    assert (declared == (actor.policy.arrival > actor.threshold)).all()
+    assert declared.any() and not declared.all()
+
+
+def result_and_rows(stop_threshold=0.0, houses=(7, 8)):
+    rows = measure(make_env, make_network(heads=('arrival',)), list(houses), decoding='sample',
+                   episodes=8, controls=('wrong goal', 'random actions'), threshold=stop_threshold)
+    split = {'houses': list(houses), 'rows': figures(rows),
+             'scenes': {str(seed): figures(own) for seed, own in by_scene(rows).items()}}
+    return {'checkpoint': 'a <b> run', 'world_version': '2', 'task': 'image',
+            'decoding': 'sample', 'max_decisions': 40, 'seed': 0, 'date': '2026-11-24',
+            'splits': {'houses': split}}, {'houses': rows}
+
+
+PLAN = {'bounds': [0, 0, 9, 6], 'walls': [[0, 0, 9, 0.1]], 'outside': [],
+        'obstacles': [[1, 1, 2, 2, 'table']],
+        'rooms_list': [{'name': 'kitchen', 'rect': [0, 0, 5, 6]}]}
+
+
+def test_the_page_has_a_map_an_episode_and_needs_nothing_else():
+    result, rows = result_and_rows()
+    plans = {'houses': {7: PLAN, 8: PLAN}}
+    page = evaluation_page(result, rows, plans, maps=5)
+    assert page.count('<svg') == page.count('<polyline') == 5
+    assert page.count('>false stop<') == 5 and 'a &lt;b&gt; run' in page
+    for outside in ('src=', 'href=', '<script', '<link', '@import', 'url('):
+        assert outside not in page
+    assert page.count('<table') == 4  # both kinds of stop, together and by house
+    assert 'nan' not in page
+    assert evaluation_page(result, rows, plans, maps=0).count('<svg') == 0
+
+
+def shown(success, start=3.0, scene=7, **fields):
+    return Episode(success=success, start_distance=start, path_length=3.0, decisions=9,
+                   collisions=0, seconds=9.0, stop_distance=0.1, stop_heading=0.1, scene=scene,
+                   **fields)
+
+
+def test_failures_and_many_houses_are_shown():
+    good = [shown(True, start, scene) for scene in (1, 2, 3) for start in (2.0, 4.0)]
+    bad = [shown(False, 5.0, 1)]
+    chosen = choose(good + bad, 4)
+    assert [e.scene for e in chosen] == [1, 2, 3, 1] and not chosen[-1].success
+    assert [e.start_distance for e in chosen[:3]] == [4.0, 4.0, 4.0]
+    assert len(choose(good + 9 * bad, 6)) == 6
+    assert sum(e.success for e in choose(good + 9 * bad, 6)) == 3
+    assert len(choose(bad, 6)) == 1 and choose([], 6) == [] and choose(good, 0) == []
+
+
+def test_outcomes_in_words():
+    assert outcome(shown(True)) == 'arrived' and outcome(shown(False)) == 'gave up'
+    assert outcome(shown(False, declared=True)) == 'false stop'
+    assert outcome(shown(True, declared=True)) == 'stopped at the goal'
+    assert 'never stopped' in outcome(shown(False, declared=False, reached=True))

@@ -1,0 +1,391 @@
+"""`vn_nav teach`: from a bag to a policy for the place where it was driven."""
+
+import json
+import math
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from ros_harness import write_checkpoint
+from small_bags import (
+    IMAGE,
+    INFO,
+    ODOMETRY,
+    START,
+    STRING,
+    camera_info,
+    make,
+    odometry,
+    picture,
+    serialised,
+)
+
+from vn_msgs_py.topics import topic
+from vn_nav.bags.mapping.pose_graph import between, compose
+from vn_nav.bags.storage.writer import BagWriter
+from vn_nav.cli import main
+from vn_nav.errors import UserError
+from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
+from vn_nav.learning.presets import preset
+from vn_nav.learning.stages import Stages
+from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.learning.teaching import OWN
+from vn_nav.learning.trainer import train
+from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_sim_bridge.floor.contacts import WORLD_VERSION
+from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.recorded.image_graph import build_graph
+from vn_sim_bridge.robot.joystick import Joystick
+from vn_sim_bridge.robot.simulated_robot import TICK
+from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.teach_place import draw_map, held_out, make_env, make_pairs
+
+ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
+SIZE = 36
+EVERY = 4  # ticks between two pictures
+
+
+def drive(seconds, rooms=1, house=7, size=SIZE):
+    """Poses [N,3] and pictures of somebody with a joystick in a small house."""
+    built = generate_house(house, rooms=rooms)
+    backend = HouseBackend([built], [0], robot=ROBOT, size=size)
+    cells = built.floor.centres()
+    start = cells[np.argmin(np.hypot(*(cells - built.goals[0].pose[:2]).T))]
+    backend.place(np.array([0]), np.array([[*start, 0.0, 0.0]]))
+    person, poses, pictures = Joystick(built, *start), [], []
+    for tick in range(int(seconds / TICK)):
+        backend.move(person.velocity(backend.poses[0])[None] * TICK)
+        if tick % EVERY == 0:
+            poses.append(backend.poses[0, :3].copy())
+            pictures.append(backend.observe().rgb[0].copy())
+    return np.array(poses), np.array(pictures)
+
+
+def write_bag(folder, poses, pictures):
+    """The drive as a recorder leaves it: pictures, odometry, calibration, and a world version."""
+    size = pictures.shape[-1]
+    with BagWriter(folder, [topic(n) for n in ('image_raw', 'odom', 'camera_info', 'scene')]) as (
+            writer):
+        def write(name, kind, time, message):
+            writer.write(name, serialised(kind, message), time)
+        write('scene', STRING, START, make(STRING, data=json.dumps(
+            {'world_version': WORLD_VERSION})))
+        for k, (x, y, yaw) in enumerate(poses):
+            time = START + round(k * EVERY * TICK * 1e9)
+            told = odometry(time, x, yaw)
+            told.pose.pose.position.y = float(y)
+            write('odom', ODOMETRY, time, told)
+            write('camera_info', INFO, time, camera_info(time, size / 2, size))
+            write('image_raw', IMAGE, time, picture(time, np.ascontiguousarray(
+                pictures[k].transpose(1, 2, 0))))
+    return folder
+
+
+@pytest.fixture(scope='module')
+def driven():
+    torch.set_num_threads(1)
+    return drive(100)
+
+
+@pytest.fixture(scope='module')
+def graph(driven):
+    poses, pictures = driven
+    return build_graph(pictures, poses, np.zeros(len(poses), int), ROBOT, goals=24,
+                       world_version=WORLD_VERSION)
+
+
+def test_a_drive_with_a_joystick_is_a_place(graph):
+    """Nothing of it is cut off, robots can turn everywhere, and ways lead to all goals."""
+    assert len(graph.goals) >= 12 and graph.geodesic(*graph.goals[0].pose[:2]).maximum > 2
+    assert graph.map.component.mean() > 0.99 and graph.world_version == WORLD_VERSION
+    env = make_env(graph, ROBOT, 16, max_decisions=60)
+    _, info = env.reset(seed=0)
+    ends = []
+    for _ in range(80):
+        _, _, terminated, truncated, info = env.step(env.oracle_actions())
+        ends += info['success'][terminated | truncated].tolist()
+    assert len(ends) > 30 and np.mean(ends) > 0.95
+
+
+def test_the_map_shows_pictures_and_goals(graph, tmp_path):
+    draw_map(tmp_path / 'map.png', *held_out(graph))
+    shown = cv2.imread(str(tmp_path / 'map.png'))[..., ::-1].reshape(-1, 3).tolist()
+    colours = {tuple(pixel) for pixel in shown}
+    assert {(42, 98, 201), (196, 87, 44), (120, 128, 140)} <= colours
+
+
+def test_picture_pairs_come_first_and_after_the_weights_of_a_checkpoint(graph, tmp_path):
+    own, others = held_out(graph)
+    config = preset('fast', channels=(8, 8, 8), features=16, hidden=16, frames=64,
+                    rollout_length=16, pair_minutes=0.01, bf16=False, learning_rate=1e-9,
+                    final_learning_rate=1e-9)
+    info = {'world_version': WORLD_VERSION, 'camera_fov_deg': 90.0, 'camera_height': 1.0}
+
+    def trained(name, **options):
+        env = make_env(own, ROBOT, 4, privileged=config.privileged, max_decisions=20)
+        return load_checkpoint(train(env, config, tmp_path / name, info=info, **options)
+                               ).network.state_dict()
+    plain = trained('plain')
+    begun = trained('begun', init=tmp_path / 'plain' / 'checkpoint',
+                    pairs=lambda: make_pairs(own, others, ROBOT, 0))
+    assert (tmp_path / 'begun' / 'pairs' / 'pairs.csv').is_file()
+    assert not (tmp_path / 'plain' / 'pairs').exists()
+    same = {name for name in plain if torch.allclose(plain[name], begun[name], atol=1e-6)}
+    assert any(name.startswith('encoder') for name in plain.keys() - same)
+    assert {name for name in plain if name.startswith('actor')} <= same
+
+
+@pytest.mark.parametrize(('words', 'says'), [
+    (['--minutes', '0'], 'some time to learn'),
+    (['--goals', '1'], 'at least four goals'),
+    (['--checkpoint', 'models/house', '--size', '32'], 'size is that of the checkpoint'),
+    (['--checkpoint', 'nowhere'], 'a checkpoint is a folder'),
+    (['--places', '1'], '2 to 1024 spots'),
+    (['--pictures', '9-3'], 'ranges in their order'),
+    (['--robot', 'nowhere.yaml'], 'a robot file exists'),
+    (['--topics', 'nowhere.yaml'], 'in a YAML file'),
+    (['--set', 'teacher=nobody'], 'the teacher is one of'),
+])
+def test_bad_options_are_one_line_and_code_2(words, says, tmp_path, capsys):
+    code = main(['teach', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), *words])
+    said = capsys.readouterr().err
+    assert code == 2 and says in said and said.count('\n') == 1
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_drive_that_leads_nowhere_is_one_line_and_code_2(driven, tmp_path, capsys):
+    poses, pictures = (part[:40] for part in driven)  # only turns, on the first spot
+    bag = write_bag(tmp_path / 'bag', poses, pictures)
+    code = main(['teach', str(bag), '--out', str(tmp_path / 'out'), '--size', '36'])
+    said = capsys.readouterr().err
+    assert code == 2 and 'leads through a place' in said and said.count('\n') == 1
+    assert not (tmp_path / 'out' / 'checkpoint').exists()
+
+
+@pytest.fixture(scope='module')
+def bag(driven, tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp('driven') / 'bag', *driven)
+
+
+@pytest.mark.slow
+def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, capsys):
+    model = write_checkpoint(tmp_path / 'model', size=SIZE, arrival=0.1, stop_threshold=0.5)
+    figures, page = tmp_path / 'figures.json', tmp_path / 'page.html'
+    words = ['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
+             '--goals', '24', '--episodes', '8', '--max-decisions', '40', '--json', str(figures)]
+    assert main([*words, '--html', str(page)]) == 0
+    assert 'all goals of bag' in capsys.readouterr().out
+    result = json.loads(figures.read_text())
+    assert result['bag'] == 'bag' and list(result['splits']) == ['all_goals']
+    rows = result['splits']['all_goals']['rows']
+    assert list(rows) == ['arrival', 'declared']
+    assert all(row['episodes'] == 8 for own in rows.values() for row in own.values())
+    success = {name: row['success'] for name, row in rows['arrival'].items()}
+    assert success['shortest path'] > 0.8 > success['random actions']
+    shown = page.read_text()
+    assert shown.count('<svg') == 6 and 'House' not in shown and 'drive bag' in shown
+    # As `vn_nav teach` divides them: other goals, so other starts.
+    assert main([*words, '--split', 'seen_goals', '--split', 'unseen_goals', '--no-controls']) == 0
+    splits = json.loads(figures.read_text())['splits']
+    assert list(splits) == ['seen_goals', 'unseen_goals']
+    own, others = (split['rows']['arrival']['right goal, sample']['start_distance']
+                   for split in splits.values())
+    assert own != others
+
+
+@pytest.mark.parametrize(('known', 'code', 'says'), [
+    ({'world_version': '0'}, 2, 'world version'), ({'world_version': 'recorded'}, 0, ''),
+    ({'task': 'room'}, 2, 'its task is image'), ({'camera_fov_deg': 60.0}, 2, 'the camera')])
+def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, bag, tmp_path,
+                                                           capsys):
+    model = write_checkpoint(tmp_path / 'model', size=SIZE)
+    config = json.loads((model / CONFIG).read_text()) | known
+    del config['config_sha256']  # changed on purpose
+    (model / CONFIG).write_text(json.dumps(config))
+    assert main(['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
+                 '--goals', '8', '--episodes', '1', '--max-decisions', '2', '--no-controls',
+                 '--no-straighten']) == code
+    assert says in capsys.readouterr().err
+
+
+def test_the_robot_needs_the_actions_of_the_checkpoint(driven, tmp_path, capsys):
+    bag = write_bag(tmp_path / 'bag', *(part[:5] for part in driven))
+    (tmp_path / 'robot.yaml').write_text(
+        'name: short\nactions:\n- {name: forward, dx: 0.3}\n- {name: backward, dx: -0.2}\n'
+        '- {name: rotate_left, dyaw_deg: 30}\n- {name: rotate_right, dyaw_deg: -30}\n')
+    assert main(['teach', str(bag), '--out', str(tmp_path / 'out'), '--checkpoint',
+                 'models/anywhere', '--robot', str(tmp_path / 'robot.yaml')]) == 2
+    assert 'how far forward moves the robot' in capsys.readouterr().err
+
+
+@pytest.fixture(scope='module')
+def houses():
+    """Poses and pictures of drives through two houses, each from where its odometry begins."""
+    found = []
+    for house in (12007, 12008):
+        poses, pictures = drive(200, rooms=3, house=house, size=96)
+        found.append((between(poses[:1], poses), pictures))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('joint', ['odometry starts again', 'odometry goes on'])
+def test_two_houses_are_no_one_place(joint, houses, tmp_path, capsys):
+    """They are refused with the pictures of each; one of them alone can be learned."""
+    (one, first), (other, second) = houses
+    if joint == 'odometry goes on':
+        other = np.array([compose(one[-1], pose) for pose in other])
+    bag = write_bag(tmp_path / 'bag', np.concatenate([one, other]),
+                    np.concatenate([first, second]))
+    words = ['teach', str(bag), '--out', str(tmp_path / 'out'), '--checkpoint', 'models/anywhere',
+             '--minutes', '0.05', '--episodes', '1']
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert '2 that have nothing in common' in said and said.count('\n') == 1
+    assert not (tmp_path / 'out' / 'checkpoint').exists()
+    own = re.search(r'learn one place with --pictures (\d+)-(\d+)', said)
+    assert own[1] == '1' and abs(int(own[2]) - len(one)) <= 20
+    assert main([*words, '--pictures', f'{own[1]}-{len(one)}']) == 0
+    assert 'moved by up to' in capsys.readouterr().out
+    info = load_checkpoint(tmp_path / 'out' / 'checkpoint').info
+    assert f'pictures 1-{len(one)}' in info['notes'] and 'recorded pictures' in info['data']
+    assert 'no episode was driven' in (tmp_path / 'out' / 'checkpoint' / 'README.md').read_text()
+    # Odometry alone shows a jump, and what goes on it cannot tell apart.
+    assert main(['evaluate', 'models/anywhere', '--bag', str(bag), '--no-straighten', '--episodes',
+                 '1', '--max-decisions', '2', '--no-controls']) == (
+                     2 if joint == 'odometry starts again' else 0)
+
+
+def test_rows_and_episodes_are_as_many_as_there_is_time_for():
+    network, before = (load_checkpoint('models/anywhere').network for _ in range(2))
+    rows = rows_of(['seen_goals', 'unseen_goals'], network, before)
+    assert rows[0] == Row('seen_goals', 'arrival', RIGHT) and len(rows) == 20
+    assert not any(row.name == BEFORE for row in rows_of(['seen_goals'], network, None))
+    costs = [Cost(LEAST, 0.01, 0.01), Cost(50, 0.055, 0.01)]  # a thousandth of a second a robot
+
+    def needed(some, envs):
+        return sum(300 * (0.01 + (row.name not in (SHORTEST, 'random actions'))
+                          * (0.005 + 0.001 * envs)) for row in some)
+    whole = plan(rows, costs, 50, math.inf, 300)
+    assert whole.episodes == 50 and whole.rows == rows and not whole.missing
+    assert math.isclose(whole.seconds, needed(rows, 50))
+    some = plan(rows, costs, 50, needed(rows, 20) + 0.01, 300)
+    assert some.episodes == 20 and some.rows == rows
+    few = plan(rows, costs, 50, needed(rows[:7], LEAST) + 0.01, 300)
+    assert few.episodes == LEAST and few.rows == rows[:7] and few.missing == rows[7:]
+    none = plan(rows, costs, 50, -1.0, 300)
+    assert none.rows == rows[:1] and none.episodes == LEAST
+    assert plan(rows, costs, 3, -1.0, 300).episodes == 3
+    many = plan(rows, costs, 2 * ENVIRONMENTS, math.inf, 300)  # two rounds
+    assert math.isclose(many.seconds, 2 * whole.seconds)
+
+
+def test_a_signal_ends_a_stage_between_two_steps_and_a_second_one_at_once(capsys):
+    before = signal.getsignal(signal.SIGINT)
+    with Stages(1.0) as stages:
+        stages('learning', 0.0)
+        signal.raise_signal(signal.SIGINT)
+        done = True  # what is under way is not torn apart
+        with pytest.raises(KeyboardInterrupt):
+            stages('learning', 0.5)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    assert done and signal.getsignal(signal.SIGINT) is before
+    assert 0 < stages.left < 60 and 'of 1 min · learning' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(('sign', 'kept'), [
+    ('learning the place', 'not measured'), ('learning the ways', 'not measured'),
+    ('arrival · right goal', 'of 20 rows')])
+def test_after_sigint_there_is_a_whole_checkpoint_and_the_rows_so_far(sign, kept, bag, tmp_path):
+    out = tmp_path / 'out'
+    with open(tmp_path / 'said', 'w') as said:
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'vn_nav.cli', 'teach', str(bag), '--out', str(out),
+             '--checkpoint', 'models/anywhere', '--goals', '8', '--cache', str(tmp_path / 'cache'),
+             '--minutes', '10' if sign == 'learning the place' else '1.2'], stdout=said,
+            stderr=subprocess.STDOUT)
+    try:
+        until = time.monotonic() + 240
+        while sign not in (tmp_path / 'said').read_text():
+            assert process.poll() is None and time.monotonic() < until
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    finally:
+        process.kill()
+    words = (tmp_path / 'said').read_text()
+    assert kept in words and 'Traceback' not in words
+    taught = load_checkpoint(out / 'checkpoint')
+    if kept == 'of 20 rows':
+        rows = json.loads((out / 'evaluation.json').read_text())['splits']['seen_goals']['rows']
+        assert RIGHT in rows['arrival'] and any('seen_goals' in name for name in
+                                                taught.info['results'])
+        assert '<svg' in (out / 'evaluation.html').read_text()
+    else:
+        assert not (out / 'evaluation.json').exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_minutes_in_the_pictures_of_a_drive_beat_chance(tmp_path, capsys):
+    bag = write_bag(tmp_path / 'bag', *drive(160, rooms=2))
+    out = tmp_path / 'out'
+    assert main(['teach', str(bag), '--out', str(out), '--size', str(SIZE), '--minutes', '2.5',
+                 '--goals', '12', '--envs', '32', '--set', 'hidden=128', '--set', 'features=128',
+                 '--episodes', '32']) == 0
+    result = json.loads((out / 'evaluation.json').read_text())
+    rows = result['splits']['seen_goals']['rows']['arrival']
+    success = {name: row['success'] for name, row in rows.items()}
+    assert success['right goal, sample'] > success['random actions'] + 0.2
+    assert success['shortest path'] > 0.95
+    said = capsys.readouterr().out
+    assert 'learning' in said and 'evaluation' in said and '2.5 minutes: reading the bag' in said
+    loaded = load_checkpoint(out / 'checkpoint')
+    assert loaded.config.size == SIZE and loaded.info['world_version'] == WORLD_VERSION
+    assert loaded.info['stop_threshold'] == 0.5 and 'Taught in the pictures' in (
+        loaded.info['notes'])
+    assert any('unseen_goals' in name for name in loaded.info['results'])
+    assert '<svg' in (out / 'evaluation.html').read_text() and (out / 'map.png').is_file()
+    assert math.isclose(loaded.info['camera_fov_deg'], 90)
+    with pytest.raises(UserError, match='a folder of its own'):
+        raise_of(bag, out)
+
+
+@pytest.mark.slow  # the evaluation
+def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, capsys):
+    """Spots and ways alone: nothing that it has learned elsewhere changes but how it counts."""
+    bag, out = write_bag(tmp_path / 'bag', *driven), tmp_path / 'out'
+    given = load_checkpoint('models/anywhere')
+    assert main(['teach', str(bag), '--out', str(out), '--checkpoint', 'models/anywhere',
+                 '--minutes', '0.8', '--goals', '8', '--episodes', '1']) == 0
+    said = capsys.readouterr().out
+    assert 'the advised action loses' in said and 'on others' in said
+    taught = load_checkpoint(out / 'checkpoint')
+    assert 2 <= taught.config.places <= 64 and taught.config.moves == given.config.moves
+    before, after = given.network.state_dict(), taught.network.state_dict()
+    for name, tensor in before.items():
+        mine = after[name][:, :tensor.shape[1]] if name == 'memory.input_weight' else after[name]
+        assert torch.allclose(mine, tensor * (OWN if name.startswith('actor') else 1)), name
+    assert 'before teaching' in (out / 'evaluation.html').read_text()
+    # Taught once more, it counts no less than before.
+    assert main(['teach', str(bag), '--out', str(tmp_path / 'again'), '--checkpoint',
+                 str(out / 'checkpoint'), '--minutes', '0.05', '--goals', '8', '--episodes',
+                 '1']) == 0
+    again = load_checkpoint(tmp_path / 'again' / 'checkpoint').network
+    assert torch.equal(again.actor.weight, taught.network.actor.weight)
+
+
+def raise_of(bag, out):
+    """Teach again where something was taught already."""
+    from vn_nav.cli import build_parser, run_teach
+    run_teach(build_parser().parse_args(['teach', str(bag), '--out', str(out)]))

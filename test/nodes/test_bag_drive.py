@@ -1,0 +1,416 @@
+"""`vn_nav bag drive`: the real policy node along a recorded drive, and how two of them differ."""
+
+import dataclasses
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+import rclpy
+from foreign_readers import assert_every_reader_accepts
+from geometry_msgs.msg import Twist
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from ros_harness import wait_until, write_checkpoint
+from rosbags.typesys import Stores, get_typestore
+from small_bags import FIXTURE, IMAGE, ODOMETRY, START, drive, make, odometry, write
+
+from vn_msgs_py.images import decode_rgb
+from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.roles import Topics, load_topics
+from vn_nav.bags.shadow.compare import (
+    Answer,
+    Shadow,
+    as_json,
+    compare,
+    figures,
+    markdown,
+    read_shadow,
+)
+from vn_nav.bags.shadow.plan import make_plan, stamped
+from vn_nav.bags.storage.reader import read_bag
+from vn_nav.bags.storage.stream import messages
+from vn_nav.cli import main
+from vn_nav.errors import UserError
+from vn_nav.nodes import shadow
+from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
+
+ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
+BASE = FIXTURE.parent.parent / 'config' / 'robots' / 'demo_base.yaml'
+FOREIGN = FIXTURE.parent / 'foreign_robot'
+NAMES = ('image: /camera/color/image_raw\nodometry: /odometry/filtered\n'
+         'command: /base/cmd_vel\n')
+END = 'std_msgs/msg/UInt8'
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+# How two differ.
+
+def shadow_of(choices, speed=0.0, episodes=None, done='forward'):
+    """Answers a second apart, and a command at each."""
+    episodes = episodes or [0] * len(choices)
+    answers = [Answer(START + k * 10**9, episode, choice, done) for k, (choice, episode)
+               in enumerate(zip(choices, episodes, strict=True)) if choice]
+    return Shadow(answers, {a.time: np.array([speed, 0.0, -2 * speed, 0.0]) for a in answers})
+
+
+def test_how_two_policies_differ_is_counted():
+    a = shadow_of(['forward', 'forward', 'forward', 'arrived', 'arrived', 'forward', 'forward'],
+                  0.1, [0, 0, 0, 0, 1, 1, 1])
+    b = shadow_of(['forward', 'backward', 'backward', 'forward', 'backward', 'forward', None],
+                  0.3, [0, 0, 0, 0, 1, 1, 1])
+    b.commands[START + 1] = np.zeros(4)  # one that a did not give
+    found = compare(a, b, ('old', 'new'), ([0.01, 0.03], [0.02]))
+    assert found.decisions == 6 and found.alone == {'a': 1, 'b': 0}
+    assert found.agree == pytest.approx(2 / 6)
+    assert found.confusion == {'arrived': {'forward': 1, 'backward': 1},
+                               'forward': {'forward': 2, 'backward': 2}}
+    assert found.arrived == {'a': [3.0, 4.0], 'b': [], 'both': []}
+    assert found.commands == 6
+    assert found.mean_dv == pytest.approx(0.2) and found.mean_dw == pytest.approx(0.4)
+    assert found.drive == {'a': pytest.approx(5 / 7), 'b': pytest.approx(3 / 6)}
+    # An episode's end ends what is in a row.
+    assert found.disagreements == 2
+    assert found.first == found.longest[0]
+    assert dataclasses.astuple(found.first) == (0, 1.0, 3.0, 3, 'forward', 'backward')
+    assert dataclasses.astuple(found.longest[1]) == (1, 4.0, 4.0, 1, 'arrived', 'backward')
+    assert found.latency['a'] == {'median': 0.02, 'p95': pytest.approx(0.029)}
+    assert json.loads(as_json(found))['confusion'] == found.confusion
+    rows = dict(figures(found))
+    assert rows['of them the same'] == '33.3%' and rows['arrived'] == 'old 2, new 0, both 0'
+    assert '1.00 to 3.00 s (episode 0)' in rows['the first']
+    text = markdown(found)
+    assert '| forward | 2 | 2 |' in text and r'mean \|dv\|' in text
+
+
+def test_drives_with_nothing_in_common_are_refused(tmp_path):
+    a = shadow_of(['forward'])
+    b = Shadow([a.answers[0]._replace(time=1)], {})
+    with pytest.raises(UserError, match='in common'):
+        compare(a, b, ('a', 'b'), ([], []))
+    with pytest.raises(UserError, match='vn_nav bag drive'):
+        read_shadow(FIXTURE)
+    same = compare(a, a, ('a', 'b'), ([], []))
+    assert same.agree == 1.0 and same.first is None and same.longest == []
+
+
+# What is shown.
+
+def test_a_decision_is_wanted_where_training_takes_a_picture(tmp_path):
+    drives = load_drives(FIXTURE, Wanted(ROBOT), tmp_path)
+    plan = make_plan(FIXTURE, ROBOT, Topics())
+    names = [None if a == MISFIT else DRIVE_ACTIONS[a] for a in drives.action]
+    assert [d.done for d in plan.decisions] == [None, *names[:-1]]
+    assert [d.last for d in plan.decisions] == [False] * (len(names) - 1) + [True]
+    assert plan.goals.shown == 1 and plan.rate == 20.0 and plan.camera_info is not None
+    events = [event for event in plan.events() if event is not None]
+    shown = [event for event in events if event.decision is not None]
+    assert [event.decision for event in shown] == plan.decisions
+    # By the clock of the headers, which the simulator drives faster than the wall's.
+    assert [event.stamp * 1e-9 for event in shown] == pytest.approx(list(drives.time), abs=1e-6)
+    ticks = [event.stamp for event in events if not event.picture]
+    assert len(ticks) > 50
+    assert np.diff(ticks) == pytest.approx(50e6, abs=1e3)
+    assert [event.log_time for event in events] == sorted(event.log_time for event in events)
+
+
+def test_another_robot_with_compressed_pictures_and_no_goal(tmp_path):
+    (tmp_path / 'topics.yaml').write_text(NAMES)
+    plan = make_plan(FOREIGN, ROBOT, load_topics(tmp_path / 'topics.yaml'))
+    assert plan.compressed and plan.goals.hindsight == 1 and plan.goals.shown == 0
+    *_, last = [e for e in plan.events() if e is not None and e.decision is not None]
+    message = STORE.deserialize_cdr(last.data, 'sensor_msgs/msg/CompressedImage')
+    assert np.array_equal(plan.goals.picture(0), decode_rgb(message))
+    grey = np.full((8, 8, 3), 128, np.uint8)
+    given = make_plan(FOREIGN, ROBOT, load_topics(tmp_path / 'topics.yaml'), grey)
+    assert given.goals.picture(0) is grey and given.goals.hindsight == 0
+
+
+def two_drives():
+    """Two episodes, the second by a clock that was set back."""
+    one = drive(4.0)
+    one.append(('/episode_end', END, START + 5 * 10**9, make(END, data=1)))
+    two = []
+    for name, kind, log_time, message in drive(4.0, seed=1):
+        if hasattr(message, 'header'):
+            message.header.stamp.sec -= 1000
+        two.append((name, kind, log_time + 10 * 10**9, message))
+    return one + two
+
+
+def test_a_clock_that_goes_back_goes_on_for_the_node(tmp_path):
+    plan = make_plan(write(tmp_path / 'bag.mcap', two_drives()), ROBOT, Topics())
+    assert {d.episode for d in plan.decisions} == {0, 1}
+    for picture_or_tick in (True, False):
+        stamps = [e.stamp for e in plan.events() if e and e.picture == picture_or_tick]
+        assert (np.diff(stamps) > 0).all() and len(stamps) > 50
+        assert stamps[-1] - stamps[0] < 20e9
+
+
+def test_unreadable_pictures_are_left_out_and_counted(tmp_path):
+    messages = drive(4.0)
+    broken = []
+    for name, kind, log_time, message in messages:
+        if kind == IMAGE and (log_time - START) // 10**8 in (17, 18, 19):
+            message.encoding = 'no such'
+        broken.append((name, kind, log_time, message))
+    whole = make_plan(write(tmp_path / 'whole.mcap', drive(4.0)), ROBOT, Topics())
+    plan = make_plan(write(tmp_path / 'bag.mcap', broken), ROBOT, Topics())
+    shown = [e.decision for e in plan.events() if e and e.decision]
+    for _ in range(2):  # each policy of a comparison reads the bag
+        list(plan.events())
+        assert plan.unreadable == 3
+    wanted = [d.time for d in plan.decisions]
+    left_out = set(wanted) - {d.time for d in shown}
+    assert len(left_out) <= 1 and wanted == [d.time for d in whole.decisions]
+    for before, after in zip(plan.decisions, plan.decisions[1:], strict=False):
+        if before.time in left_out:  # nobody can have told it what was done since the last one
+            assert next(d for d in shown if d.time == after.time).done is None
+
+
+def test_what_cannot_be_driven_is_one_line(tmp_path, capsys):
+    checkpoint = str(write_checkpoint(tmp_path / 'policy', size=84))
+    cut = tmp_path / 'cut'
+    shutil.copytree(FIXTURE, cut)
+    file, = cut.glob('*.mcap')
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    late = write(tmp_path / 'late.mcap', [
+        (name, kind, time + (1 << 62), message) for name, kind, time, message in drive(2.0)])
+    wrong = write(tmp_path / 'wrong.mcap', [
+        ('/image_raw', ODOMETRY, START, odometry(START, 0.0)),
+        ('/odom', ODOMETRY, START, odometry(START, 0.0))])
+    blind = write(tmp_path / 'blind.mcap', [m for m in drive(2.0) if m[0] != '/image_raw'])
+    narrow = tmp_path / 'narrow.mcap'
+    messages = drive(2.0)
+    for _, kind, _, message in messages:
+        if kind.endswith('CameraInfo'):
+            message.k[0] = 100.0
+    write(narrow, messages)
+    text = tmp_path / 'goal.png'
+    text.write_text('no picture')
+    for words, expected in (
+            ([cut], 'recover'), ([tmp_path / 'nowhere'], 'nowhere'), ([late], '2038'),
+            ([wrong], 'sensor_msgs/msg/Image'), ([blind], '--topics'), ([narrow], 'deg'),
+            ([FIXTURE, '--goal', text], 'goal.png'), ([FIXTURE, '--robot', text], 'robot'),
+            ([FIXTURE, '--compare', tmp_path], 'config.json'),
+            ([FIXTURE, '--out', tmp_path], 'folder of its own')):
+        out = [] if '--out' in words else ['--out', tmp_path / 'out']
+        code = main(['bag', 'drive', *map(str, [*words, *out]), '--checkpoint', checkpoint])
+        error = capsys.readouterr().err
+        assert code == 2 and error.count('\n') == 1, error
+        assert expected in error
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_stamp_is_replaced_in_place():
+    message = STORE.serialize_cdr(odometry(START, 1.5), ODOMETRY)
+    back = STORE.deserialize_cdr(stamped(bytes(message), 7_000_000_008), ODOMETRY)
+    assert (back.header.stamp.sec, back.header.stamp.nanosec) == (7, 8)
+    assert back.pose.pose.position.x == 1.5 and back.header.frame_id == 'base_link'
+
+
+# The real node.
+
+@pytest.fixture
+def stranger():
+    """Makes a node on a ROS domain."""
+    made = []
+
+    def make(domain, *, listens_to=None):
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain)
+        node = rclpy.create_node('stranger', context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        made.append((context, node, executor))
+        if listens_to:
+            node.create_subscription(Twist, listens_to, lambda _: None, 10)
+        return node
+    yield make
+    for context, node, executor in made:
+        executor.shutdown()
+        node.destroy_node()
+        context.try_shutdown()
+
+
+@pytest.mark.ros
+def test_a_domain_where_somebody_is_is_not_taken(stranger, monkeypatch):
+    monkeypatch.setattr(shadow, 'ALONE', 60.0)  # it ends with the first that is heard of
+    stranger(231)
+    with pytest.raises(UserError, match='231: .*stranger'):
+        shadow._Domain([231])
+    monkeypatch.setattr(shadow, 'ALONE', 0.1)
+    with shadow._Domain(range(225, 230)) as one, shadow._Domain(range(225, 231)) as other:
+        assert one.number != other.number and one.namespace != other.namespace
+        with pytest.raises(UserError, match='another shadow'):
+            shadow._Domain([one.number])
+
+
+def alone(runtime, drives, robot):
+    """What a policy says of a drive's steps, asked without ROS."""
+    goal = drives.goals[drives.goal[-1]]
+    runtime.set_goal(np.array(goal))
+    choices, before = [], MISFIT
+    for image, action in zip(drives.image, drives.action, strict=True):
+        runtime.correct(before)
+        choice = runtime.act(np.array(image))
+        choices.append('arrived' if runtime.arrived else robot.action_names[choice])
+        before = int(action)
+    return choices
+
+
+def said_in(folder):
+    """All that does not come by the wall clock, topic by topic."""
+    records = sorted(read_bag(folder), key=lambda record: record.topic)
+    return [(r.topic, r.stamp, STORE.serialize_cdr(r.message, r.message.__msgtype__).tobytes())
+            for r in records if not r.topic.endswith('diagnostics')]
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_node_says_along_a_bag_what_the_policy_says_without_ros(tmp_path, capfd):
+    first = write_checkpoint(tmp_path / 'first')
+    sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
+    arguments = ['bag', 'drive', str(FIXTURE), '--robot', str(BASE), '--checkpoint', str(first)]
+    assert main([*arguments, '--compare', str(sure), '--out', str(tmp_path / 'both')]) == 0
+    said = capfd.readouterr().out
+    assert 'shadow' in said and 'first against sure' in said
+    drives = load_drives(FIXTURE, Wanted(ROBOT), tmp_path / 'cache')
+    a, b = (read_shadow(tmp_path / 'both' / name) for name in 'ab')
+    expected = alone(PolicyRuntime(first), drives, ROBOT)
+    assert [answer.choice for answer in a.answers] == expected and len(set(expected)) > 1
+    assert [answer.choice for answer in b.answers] == ['arrived'] * len(expected)
+    assert [answer.done for answer in a.answers[:-1]] == [
+        DRIVE_ACTIONS[action] for action in drives.action[:-1]]
+    found = json.loads((tmp_path / 'both' / 'comparison.json').read_text())
+    assert found['decisions'] == len(expected) and found['agree'] == 0.0
+    assert len(found['arrived']['b']) == len(expected) and not found['arrived']['a']
+    assert found['mean_dv'] + found['mean_dw'] > 0.1 and found['latency']['b']['median'] > 0
+    assert 'first against sure' in (tmp_path / 'both' / 'comparison.md').read_text()
+    # Within the base's limits, and where the policy stands by its own word it stands.
+    base = load_robot(BASE)
+    sent = np.array(list(a.commands.values()))
+    assert len(sent) > 80 and sent.any()
+    assert np.abs(sent[:, 0]).max() <= base.max_linear + 1e-9
+    rise = np.abs(np.diff(sent, axis=0))
+    assert rise[:, 0].max() <= base.linear_acceleration / 20 + 1e-6
+    assert rise[:, 2].max() <= base.angular_acceleration / 20 + 1e-6
+    assert not np.array(list(b.commands.values())).any()
+    # The stamps are the bag's, nothing in it can reach a base, and everybody can read it.
+    pictures = {r.stamp for r in read_bag(FIXTURE, ('image_raw',))}
+    assert {answer.time for answer in a.answers} <= pictures
+    odometries = {r.stamp for r in read_bag(FIXTURE, ('odom',))}
+    assert a.commands.keys() <= pictures | odometries
+    assert {r.topic.split('/')[0] for r in read_bag(tmp_path / 'both' / 'a')} == {'shadow'}
+    assert_every_reader_accepts(tmp_path / 'both' / 'a')
+    # Again, and the same.
+    assert main([*arguments, '--out', str(tmp_path / 'again')]) == 0
+    assert said_in(tmp_path / 'again') == said_in(tmp_path / 'both' / 'a')
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_foreign_drive_towards_a_picture(tmp_path, capfd):
+    """JPEG pictures, no camera_info, a goal from a file."""
+    (tmp_path / 'topics.yaml').write_text(NAMES)
+    goal = np.random.default_rng(0).integers(0, 255, (84, 84, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / 'goal.png'), goal[:, :, ::-1])
+    checkpoint = write_checkpoint(tmp_path / 'policy')
+    assert main(['bag', 'drive', str(FOREIGN), '--checkpoint', str(checkpoint), '--topics',
+                 str(tmp_path / 'topics.yaml'), '--goal', str(tmp_path / 'goal.png'), '--decoding',
+                 'greedy', '--out', str(tmp_path / 'out')]) == 0
+    assert '1 by --goal' in capfd.readouterr().out
+    shown, = read_bag(tmp_path / 'out', ('shadow/goal_image',))
+    assert np.array_equal(decode_rgb(shown.message), goal)
+    robot = dataclasses.replace(ROBOT, camera_fov=math.radians(90))
+    drives = load_drives(FOREIGN, Wanted(robot, topics=load_topics(tmp_path / 'topics.yaml')),
+                         tmp_path / 'cache')
+    drives.goals, drives.goal[:] = goal.transpose(2, 0, 1)[None], 0
+    assert [answer.choice for answer in read_shadow(tmp_path / 'out').answers] == alone(
+        PolicyRuntime(checkpoint, decoding='greedy'), drives, ROBOT)
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_two_episodes_by_commands_alone(tmp_path, capfd):
+    """No odometry, a clock that goes back in between, and a policy that always has arrived."""
+    bag = write(tmp_path / 'bag.mcap', [m for m in two_drives() if m[0] != '/odom'])
+    sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
+    assert main(['bag', 'drive', str(bag), '--checkpoint', str(sure), '--out',
+                 str(tmp_path / 'out')]) == 0
+    assert '2 last pictures of episodes' in capfd.readouterr().out
+    plan = make_plan(bag, ROBOT, Topics())
+    answers = read_shadow(tmp_path / 'out').answers
+    assert [(a.episode, a.choice) for a in answers] == [
+        (d.episode, 'arrived') for d in plan.decisions] and len(answers) > 4
+    shown = list(read_bag(tmp_path / 'out', ('shadow/goal_image',)))
+    assert len(shown) == 2
+    for episode, record in enumerate(shown):
+        assert np.array_equal(decode_rgb(record.message), plan.goals.picture(episode))
+    said = [r.message.data for r in read_bag(tmp_path / 'out', ('shadow/arrived',))]
+    assert sum(said) == len(answers) and said[-1]
+
+
+@pytest.fixture
+def long_drive(tmp_path):
+    """A drive of five minutes, under way: the process, its output, and the second bag."""
+    bag = write(tmp_path / 'bag.mcap', drive(300.0), chunk=1 << 20)
+    checkpoint = write_checkpoint(tmp_path / 'policy')
+    out, log = tmp_path / 'out', tmp_path / 'log'
+    with open(log, 'w') as file:
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'vn_nav.cli', 'bag', 'drive', str(bag), '--checkpoint',
+             str(checkpoint), '--out', str(out)], stdout=file, stderr=subprocess.STDOUT)
+
+    def decided():
+        return (out / 'metadata.yaml').exists() and sum(
+            1 for _ in messages(out, ['shadow/action'], strict=False)) > 2
+    try:
+        wait_until(lambda: process.poll() is not None or decided(), lambda: time.sleep(0.2), 200)
+        assert process.poll() is None, log.read_text()
+        yield process, log, out
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_a_whole_bag(long_drive, number):
+    process, log, out = long_drive
+    process.send_signal(number)
+    assert process.wait(30) == 130, log.read_text()
+    assert 'whole' in log.read_text() and 'Traceback' not in log.read_text()
+    assert_every_reader_accepts(out)
+    assert 0 < len(read_shadow(out).answers) < 180
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize('listens', [False, True])
+def test_somebody_who_comes_ends_it(long_drive, stranger, listens):
+    process, log, out = long_drive
+    words = log.read_text().split()
+    domain = int(words[words.index('domain') + 1].rstrip(','))
+    namespace = words[words.index('namespace') + 1].rstrip(':')
+    stranger(domain, listens_to=f'{namespace}/shadow/cmd_vel' if listens else None)
+    assert process.wait(30) == 2, log.read_text()
+    said = log.read_text()
+    # Who listens is known at times before its node's name is.
+    assert 'stranger' in said or listens and 'which listens to' in said
+    assert 'Traceback' not in said
+    assert_every_reader_accepts(out)

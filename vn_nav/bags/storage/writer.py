@@ -1,0 +1,372 @@
+"""Writing rosbag2 bags (MCAP, zstd chunks, metadata version 9) from serialised messages."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import errno
+import functools
+import os
+import textwrap
+import threading
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from vn_msgs_py.topics import BEST_EFFORT, LATCHED, Topic
+from vn_nav.bags.storage.definitions import definition
+from vn_nav.bags.storage.output import CHUNK, McapOutput
+from vn_nav.errors import UserError
+
+FLUSH = 1.0  # s between flushes: what a power cut may cost
+MIN_FREE = 1_000_000_000  # bytes
+WAITING = 64 << 20  # bytes that may wait for the disk before `write` does
+SOON = 0.1  # s to the flush after the first message of a topic: metadata.yaml is to name it
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}  # as Jazzy writes a duration without end
+
+
+class RecordingStopped(UserError):
+    """The disk has no room left, or failed; what was recorded before is whole."""
+
+    def __init__(self, folder: Path, reason: str):
+        super().__init__('a bag is recorded while its disk has room', reason,
+                         f'{folder} is whole up to here: free some space and begin another bag')
+
+
+@dataclasses.dataclass(frozen=True)
+class _Channel:
+    """A topic as the bag has it."""
+
+    name: str
+    topic: Topic
+    definition: str
+    digest: str  # RIHS01
+
+
+class _Waiting(NamedTuple):
+    channel: _Channel
+    data: bytes
+    stamp: int
+    sequence: int
+
+
+@dataclasses.dataclass
+class _File:
+    """A file of the bag as metadata.yaml has it."""
+
+    name: str
+    span: tuple[int, int] | None = None  # least and greatest stamp
+    counts: collections.Counter[_Channel] = dataclasses.field(default_factory=collections.Counter)
+    text: str = ''  # once it is finished
+
+
+class BagWriter:
+    """A bag being recorded; a context manager.
+
+    A thread of its own compresses and writes, so that a slow disk does not hold up who calls. It
+    writes what has come every second, also to the disk itself and with a metadata.yaml that counts
+    it, and every full chunk at once. When
+    less than `min_free` is left, or writing fails, it finishes the bag and `stopped` says why.
+    A topic is in the bag from its first message on.
+
+    Args:
+        folder: of the bag; it must not exist. Its files are FOLDER_0.mcap, FOLDER_1.mcap...
+        topics: what will be written; `add` takes more.
+        max_bytes: a file that has grown so large is followed by another; 0: never.
+        max_seconds: likewise, by the time since it was begun.
+        min_free: bytes that stay free on the disk.
+
+    Raises:
+        UserError: the folder exists or cannot be made, there is no room, or a type is unknown.
+    """
+
+    def __init__(self, folder: str | Path, topics: Iterable[Topic] = (), *, max_bytes: int = 0,
+                 max_seconds: float = 0.0, min_free: int = MIN_FREE):
+        self.folder = Path(folder)
+        self._max_bytes, self._max_seconds, self._min_free = max_bytes, max_seconds, min_free
+        self.stopped = ''  # why, in words
+        # By name in the bag; another counter every second.
+        self.written: collections.Counter[str] = collections.Counter()
+        self._added: dict[str, _Channel] = {}
+        for topic in topics:
+            self.add(topic)
+        self._files: list[_File] = []
+        self._before: collections.Counter[_Channel] = collections.Counter()  # in finished files
+        self._file: McapOutput | None = None
+        self._queue: collections.deque[_Waiting] = collections.deque()
+        self._bytes = 0  # in the queue
+        self._closing = False
+        self._change = threading.Condition()
+        try:
+            self.folder.mkdir(parents=True)
+        except OSError as error:
+            raise UserError('a bag is recorded into a folder of its own', str(error),
+                            'choose another folder, or remove it') from error
+        try:
+            self._check_room()
+            self._begin_file()
+        except OSError as error:
+            for path in self.folder.iterdir():
+                path.unlink()
+            self.folder.rmdir()
+            raise UserError('a bag is recorded where there is room', f'{folder}: {error}',
+                            'free some space, or choose another disk') from error
+        self._thread = threading.Thread(target=self._work, name='bag writer', daemon=True)
+        self._thread.start()
+
+    def add(self, topic: Topic) -> None:
+        """Take another topic; one of the same name is written with this type from now on.
+
+        Raises:
+            UserError: nobody knows its type.
+        """
+        name = topic.name if topic.name.startswith('/') else f'/{topic.name}'
+        self._added[topic.name] = _Channel(name, topic, *definition(topic.type))
+
+    def write(self, name: str, data: bytes, stamp: int, sequence: int = 0) -> None:
+        """Append one CDR message of a topic; it is not copied. Waits where the disk is slow.
+
+        Args:
+            name: of the topic, as it was added.
+            data: the message.
+            stamp: when it was published, ns since 1970.
+            sequence: the publisher's number of it, if there is one.
+
+        Raises:
+            RecordingStopped: this message is not in the bag.
+        """
+        if not 0 <= stamp < 1 << 63:
+            raise ValueError(f'a stamp is nanoseconds since 1970; received {stamp}')
+        item = _Waiting(self._added[name], data, stamp, sequence)
+        with self._change:
+            while self._bytes > WAITING and not self.stopped:
+                self._change.wait()
+            if self.stopped:
+                raise RecordingStopped(self.folder, self.stopped)
+            self._queue.append(item)
+            self._bytes += len(data)
+            self._change.notify_all()
+
+    def close(self) -> None:
+        """Finish the file and its metadata.
+
+        Raises:
+            RecordingStopped: messages that were taken may be missing.
+        """
+        with self._change:
+            self._closing = True
+            self._change.notify_all()
+        self._thread.join()
+        if self.stopped:
+            raise RecordingStopped(self.folder, self.stopped)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(self, kind, *_):
+        try:
+            self.close()
+        except RecordingStopped:
+            if kind is None:  # else the exception on its way says more
+                raise
+
+    def _work(self) -> None:
+        """The thread: never raises."""
+        self._due, told = time.monotonic() + FLUSH, 0
+        try:
+            while (item := self._take(self._due)) or not self._closing:
+                if item:
+                    self._put(item)
+                if time.monotonic() >= self._due:
+                    self._file.flush()
+                    self._file.sync()
+                    self._count()
+                    self._check_room()
+                    if told != (told := self.written.total()):
+                        self._write_metadata()
+                    self._due = time.monotonic() + FLUSH
+            self._file.flush()
+        except Exception as error:  # also a bug must not leave writers waiting for ever
+            self._stop(error)
+        try:
+            # What metadata.yaml takes has to be free still when the file is finished.
+            if self._file is not None:
+                self._end_file(spare=len(self._describe()) + 8192 if self.stopped else 0)
+        except Exception as error:
+            self._stop(error)
+
+    def _take(self, due: float) -> _Waiting | None:
+        """The next message, unless none comes in time or ever."""
+        with self._change:
+            while not self._queue and not self._closing and (left := due - time.monotonic()) > 0:
+                self._change.wait(left)
+            if not self._queue:
+                return None
+            item = self._queue.popleft()
+            self._bytes -= len(item.data)
+            self._change.notify_all()
+            return item
+
+    def _put(self, item: _Waiting) -> None:
+        self._unchecked += len(item.data)
+        if self._unchecked >= CHUNK:
+            self._check_room()
+        if self._channels and (
+                0 < self._max_bytes <= self._file.size
+                or 0 < self._max_seconds <= time.monotonic() - self._begun):
+            self._file.flush()
+            self._end_file()
+            self._begin_file()
+        channel = item.channel
+        if channel not in self._channels:
+            self._channels[channel] = self._file.channel(
+                channel.name, channel.topic.type, channel.definition,
+                {'offered_qos_profiles': _yaml([_quality(channel.topic)]),
+                 'topic_type_hash': channel.digest})
+            self._due = min(self._due, time.monotonic() + SOON)
+        self._file.add(self._channels[channel], item.data, item.stamp, item.sequence)
+
+    def _stop(self, error: Exception) -> None:
+        words = (error.strerror if isinstance(error, OSError)
+                 else f'{type(error).__name__}: {error}')
+        with self._change:
+            self.stopped = self.stopped or words
+            self._queue.clear()
+            self._change.notify_all()
+
+    def _check_room(self) -> None:
+        self._unchecked = 0  # bytes since
+        disk = os.statvfs(self.folder)
+        free = disk.f_bavail * disk.f_frsize
+        if free < self._min_free:
+            raise OSError(errno.ENOSPC, f'{free / 1e9:.3f} GB free, less than '
+                                        f'{self._min_free / 1e9:g} GB')
+
+    def _begin_file(self) -> None:
+        path = self.folder / f'{self.folder.name}_{len(self._files)}.mcap'
+        self._file, self._begun = McapOutput(path), time.monotonic()
+        self._channels: dict[_Channel, int] = {}  # ids in the present file
+        self._files.append(_File(path.name))
+        self._write_metadata(folder=True)
+
+    def _end_file(self, spare: int = 0) -> None:
+        file = self._file
+        try:
+            file.finish(spare)
+        finally:
+            self._count()
+            self._file = None
+            ended = self._files[-1]
+            ended.text = _file_text(ended)
+            self._before += ended.counts
+        self._write_metadata(folder=True)
+
+    def _count(self) -> None:
+        """Look at what the present file holds."""
+        present = self._files[-1]
+        present.span = self._file.span
+        present.counts = collections.Counter(
+            {channel: self._file.counts[number] for channel, number in self._channels.items()
+             if self._file.counts[number]})
+        written: collections.Counter[str] = collections.Counter()
+        for channel, count in self._counts().items():
+            written[channel.name] += count
+        self.written = written
+
+    def _counts(self) -> collections.Counter[_Channel]:
+        present = self._files[-1]
+        return self._before + (collections.Counter() if present.text else present.counts)
+
+    def _write_metadata(self, *, folder: bool = False) -> None:
+        """Replace metadata.yaml: whole at any moment, so that a killed recording is a bag.
+
+        Args:
+            folder: have the disk hold the names of the files as well.
+        """
+        path = self.folder / 'metadata.yaml'
+        partial = path.with_suffix('.yaml.tmp')
+        try:
+            with open(partial, 'w', encoding='utf-8') as file:
+                file.write(self._describe())
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
+        if folder:
+            names = os.open(self.folder, os.O_RDONLY)
+            try:
+                os.fsync(names)
+            finally:
+                os.close(names)
+
+    def _describe(self) -> str:
+        """The text of metadata.yaml (rosbag2_storage, metadata version 9).
+
+        Written every second: what stays the same is text already, as a dumper would take a
+        hundred times as long.
+        """
+        spans = [file.span for file in self._files if file.span]
+        span = (min(first for first, _ in spans),
+                max(last for _, last in spans)) if spans else None
+        counts = self._counts()
+        topics = [f'{_topic_text(channel)}      message_count: {count}\n'
+                  for channel, count in counts.items()]
+        return ''.join((
+            'rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: mcap\n',
+            _times_text(span, '  '), f'  message_count: {counts.total()}\n',
+            '  topics_with_message_count:', '\n' if topics else ' []\n', *topics,
+            # Of chunks: rosbag2 leaves that to MCAP.
+            "  compression_format: ''\n  compression_mode: ''\n", '  relative_file_paths:\n',
+            *(f'    - {_scalar(file.name)}\n' for file in self._files), '  files:\n',
+            *(file.text or _file_text(file) for file in self._files),
+            '  custom_data: null\n  ros_distro: jazzy\n'))
+
+
+class _NoAliases(yaml.SafeDumper):
+    """Repeats equal parts, as rosbag2 does, instead of referring to the first."""
+
+    def ignore_aliases(self, data):
+        return True
+
+
+def _yaml(data: object) -> str:
+    return yaml.dump(data, Dumper=_NoAliases, sort_keys=False, width=1000)
+
+
+@functools.cache
+def _scalar(text: str) -> str:
+    """A text as YAML has it, in quotes where it needs them."""
+    return _yaml([text]).removeprefix('- ').strip()
+
+
+@functools.cache
+def _topic_text(channel: _Channel) -> str:
+    return textwrap.indent(_yaml([{'topic_metadata': {
+        'name': channel.name, 'type': channel.topic.type, 'serialization_format': 'cdr',
+        'offered_qos_profiles': [_quality(channel.topic)],
+        'type_description_hash': channel.digest}}]), '    ')
+
+
+def _file_text(file: _File) -> str:
+    return (f'    - path: {_scalar(file.name)}\n{_times_text(file.span, "      ")}'
+            f'      message_count: {file.counts.total()}\n')
+
+
+def _times_text(span: tuple[int, int] | None, indent: str) -> str:
+    first, last = span or (0, 0)
+    return (f'{indent}duration:\n{indent}  nanoseconds: {last - first}\n'
+            f'{indent}starting_time:\n{indent}  nanoseconds_since_epoch: {first}\n')
+
+
+def _quality(topic: Topic) -> dict:
+    """The QoS of a topic as rosbag2 writes it."""
+    return {'history': 'keep_last', 'depth': topic.depth,
+            'reliability': 'best_effort' if topic.reliability == BEST_EFFORT else 'reliable',
+            'durability': 'transient_local' if topic.durability == LATCHED else 'volatile',
+            'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
+            'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False}

@@ -1,0 +1,254 @@
+"""`vn_nav demo`: bridge, policy and recorder as processes on ROS 2, then figures from the bag."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from vn_nav.errors import UserError
+from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode, drives_from_bag
+from vn_nav.evaluation.evaluator import (
+    ARRIVAL,
+    DECLARED,
+    STOP_THRESHOLD,
+    PolicyActor,
+    random_actor,
+    run_episodes,
+)
+from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
+from vn_nav.nodes.processes import Processes, ProcessFailure
+from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
+from vn_nav.report.demo_page import write_report
+from vn_nav.report.tables import TITLES
+from vn_nav.report.terminal import print_table
+from vn_nav.resources import share_file
+from vn_nav.robot import RobotSpec
+
+TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
+UNSEEN_HOUSE = 8  # seed
+SEED = 2026  # of starts, goals and light
+BASE = 'config/robots/demo_base.yaml'
+HEARS = 60.0  # s until the recorder has met a node
+STALL = 60.0  # s without a finished episode after which the demo gives up
+LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up|stopped elsewhere) after (\d+) '
+                  r'decisions, ([\d.]+) m')
+RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground_truth/odom',
+            'action', 'action_names', 'arrived', 'collision', 'reward', 'episode_end', 'episode',
+            'episode_result', 'scene', '/diagnostics']
+
+
+def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
+        unseen_episodes: int = 10) -> int:
+    """Drive, record, measure, report.
+
+    A checkpoint with a stop threshold has to declare its stop; for others arriving is enough.
+
+    Args:
+        out: folder for bag, page and result.json; what an earlier demo left there is replaced.
+        folder: of the checkpoint.
+        make_env: as `cli.world.make_env`, for the controls without ROS.
+        episodes, unseen_episodes: in the trained and in the unseen house.
+
+    Returns:
+        The exit code.
+    """
+    if episodes < 1 or unseen_episodes < 1:
+        raise UserError('the demo has at least one episode in each house',
+                        (episodes, unseen_episodes), 'raise --episodes, --unseen-episodes')
+    console = Console()
+    loaded = load_checkpoint(folder)
+    info = loaded.info
+    places = (('trained', info['houses'][0], episodes, TRAINED_LIMIT),
+              ('unseen', UNSEEN_HOUSE, unseen_episodes, UNSEEN_LIMIT))
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ('bag', 'logs'):
+        shutil.rmtree(out / name, ignore_errors=True)
+    for name in ('report.html', 'result.json'):
+        (out / name).unlink(missing_ok=True)
+    begun = time.monotonic()
+    console.print('[bold]vn_nav demo[/]: a picture in, a robot that drives there. Simulator and '
+                  'policy are two processes that meet on ROS 2 topics alone.')
+    processes = Processes(out / 'logs')
+    try:
+        processes.start('recorder', 'vn_nav.nodes.recorder_node',
+                        {'output': str(out / 'bag'), 'topics': RECORDED})
+        for index, (place, house, count, limit) in enumerate(places):
+            _drive(console, processes, folder, loaded, place, house, count, limit,
+                   start_time=1.0 + 1e5 * index)
+    except ProcessFailure as error:
+        console.print(f'[red]vn_nav demo: {error}[/]; logs are in {out / "logs"}')
+        return 1
+    finally:
+        processes.stop_all()
+    if processes.killed:
+        console.print(f'[red]vn_nav demo: {", ".join(processes.killed)} did not end within 10 s '
+                      f'of SIGINT and had to be killed[/]; logs are in {out / "logs"}')
+        return 1
+    drives = drives_from_bag(out / 'bag', pictures=True)
+    result = _results(drives, places, loaded, make_env)
+    result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
+               'checkpoint': folder.name, 'date': datetime.date.today().isoformat()}
+    write_report(out / 'report.html', drives, result)
+    result['seconds'] = round(time.monotonic() - begun, 1)
+    (out / 'result.json').write_text(json.dumps(result, indent=2) + '\n')
+    _show(console, result, out)
+    return 0
+
+
+def bridge_parameters(checkpoint: LoadedCheckpoint, house: int, count: int, limit: int) -> dict:
+    """What the sim bridge simulates in one house. `control_env` simulates the same."""
+    info = checkpoint.info
+    return {'house': house, 'rooms': info['rooms'], 'size': checkpoint.config.size,
+            'randomisation': info['randomisation'], 'seed': SEED, 'stop': _stop(info),
+            'robot': str(share_file(BASE)), 'episodes': count, 'max_decisions': limit}
+
+
+def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, house: int, count: int,
+                limit: int):
+    """The same house without ROS: environment k, reset with SEED, begins as episode k over ROS.
+
+    Goal, its picture, start, light and base are equal. Not equal are the numbers behind motion
+    noise, sensor noise, slip and late pictures, which the bridge draws a tick, not a decision,
+    and those behind sampled actions.
+    """
+    same = bridge_parameters(checkpoint, house, count, limit)
+    # The seed of the goal pictures' light is the configuration's, whatever `reset` is given.
+    return make_env([same['house']], same['rooms'], same['episodes'], size=same['size'],
+                    randomisation=same['randomisation'], seed=same['seed'], stop=same['stop'],
+                    robot=Path(same['robot']), max_decisions=same['max_decisions'],
+                    actions=checkpoint.config.actions)
+
+
+def _drive(console: Console, processes: Processes, folder: Path, checkpoint: LoadedCheckpoint,
+           place: str, house: int, count: int, limit: int, start_time: float) -> None:
+    """All episodes in one house."""
+    bridge, policy = f'bridge_{place}', f'policy_{place}'
+    note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
+    console.print(f'\n[bold]{place} house[/], seed {house}{note}')
+    processes.start(policy, 'vn_nav.nodes.policy_node', {
+        'checkpoint': str(folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
+        'auto_enable': True, 'seed': SEED}, (f'__node:={policy}',))
+    # A robot that is where it wants to be at once would be gone before the recorder has met it.
+    _wait_until_heard(processes, policy)
+    processes.start(bridge, 'vn_sim_bridge.bridge_node',
+                    bridge_parameters(checkpoint, house, count, limit) | {
+                        'time': 'lock_step', 'start_time': start_time, 'exit_when_done': True})
+    seen, progress = 0, time.monotonic()
+    with Live(_progress([], count), console=console, refresh_per_second=8) as live:
+        while True:
+            done = LINE.findall(processes.log(bridge))
+            if len(done) > seen:
+                seen, progress = len(done), time.monotonic()
+            live.update(_progress(done, count))
+            processes.check('recorder')
+            processes.check(policy)
+            processes.check(bridge)
+            if processes.running[bridge].poll() is not None:
+                live.update(_progress(LINE.findall(processes.log(bridge)), count))
+                break
+            if time.monotonic() - progress > STALL:
+                words = (processes.log(policy).strip().splitlines() or ['nothing'])[-1]
+                raise ProcessFailure(f"no episode ended for {STALL:.0f} s; the policy's last "
+                                     f'words: {words}')
+            time.sleep(0.1)
+    processes.stop(policy)
+    processes.stop(bridge)
+
+
+def _wait_until_heard(processes: Processes, name: str) -> None:
+    until = time.monotonic() + HEARS
+    while f'hears /{name}\n' not in processes.log('recorder'):
+        for child in ('recorder', name):
+            processes.check(child)
+        if time.monotonic() > until:
+            raise ProcessFailure(f'the recorder has not met {name} within {HEARS:.0f} s')
+        time.sleep(0.05)
+
+
+def _stop(info: dict) -> str:
+    """What ends an episode before its limit, by what a checkpoint says of itself."""
+    return ARRIVAL if info['stop_threshold'] is None else DECLARED
+
+
+def _progress(done: list[tuple], count: int) -> Table:
+    """The live view: one row an episode, the newest at the bottom."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ('episode', 'goal', 'outcome', 'decisions', 'metres'):
+        table.add_column(heading, justify='left' if heading in ('goal', 'outcome') else 'right')
+    for number, room, outcome, decisions, metres in done[-12:]:
+        colour = 'green' if outcome == 'arrived' else 'yellow'
+        table.add_row(f'{int(number) + 1}/{count}', room, f'[{colour}]{outcome}[/]', decisions,
+                      metres)
+    if len(done) < count:
+        table.add_row(f'{len(done) + 1}/{count}', '...', 'driving' if done else 'starting', '', '')
+    return table
+
+
+def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint,
+             make_env: Callable) -> dict:
+    """Figures from the bag; on the same starts random actions, and the policy without ROS."""
+    info, result = checkpoint.info, {}
+    stop = _stop(info)
+    for (place, house, count, limit), drive in zip(places, drives, strict=True):
+        figures = summarise([recorded.episode for recorded in drive.episodes])
+        env = control_env(make_env, checkpoint, house, count, limit)
+        control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
+        actor = PolicyActor(env, checkpoint.network, info['decoding'], SEED,
+                            STOP_THRESHOLD if stop == ARRIVAL else info['stop_threshold'])
+        in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
+        result[place] = figures | {'house': house, 'max_decisions': limit, 'stop': stop,
+                                   'random': summarise(control),
+                                   'without_ros': summarise(in_process),
+                                   'minus_without_ros': _paired(drive.episodes, in_process)}
+    return result
+
+
+def _paired(recorded: list[RecordedEpisode], in_process: list[Episode]) -> dict:
+    """Success and decisions over ROS minus those without it, on the same starts; 95 %."""
+    found = {}
+    for name in ('success', 'decisions'):
+        differences = [float(getattr(one.episode, name)) - float(getattr(two, name))
+                       for one, two in zip(recorded, in_process, strict=True)]
+        found[name] = sum(differences) / len(differences)
+        found[f'{name}_interval'] = list(bootstrap_interval(differences))
+    return found
+
+
+def _show(console: Console, result: dict, out: Path) -> None:
+    for place in ('trained', 'unseen'):
+        figures = result[place]
+        stop = f', {TITLES[DECLARED].lower()}' if figures['stop'] == DECLARED else ''
+        console.print()
+        print_table(f'Measured from the bag: {place} house, {figures["episodes"]} episodes{stop}',
+                    *_cells(figures))
+    for name, path in (('page', 'report.html'), ('bag', 'bag'), ('figures', 'result.json')):
+        console.print(f'{name:7} {out / path}', highlight=False, soft_wrap=True)
+    console.print(f'{result["seconds"]:.0f} s in all; in brackets 95 % intervals',
+                  highlight=False)
+
+
+def _cells(figures: dict) -> tuple[list[str], list[list[str]]]:
+    """Headings and lines of one house's table."""
+    declared = figures['stop'] == DECLARED
+    headings = ['policy', 'success', 'SPL', 'decisions', 'collisions',
+                *(('declared', 'false\nstops') if declared else ())]
+    lines = []
+    for policy, r in (('over ROS 2', figures), ('without ROS', figures['without_ros']),
+                      ('random', figures['random'])):
+        low, high = r['success_interval']
+        lines.append([
+            policy, f'{r["success"]:.0%} ({100 * low:.0f}-{100 * high:.0f})', f'{r["spl"]:.2f}',
+            '{:.0f} ({:.0f}-{:.0f})'.format(r['decisions'], *r['decisions_interval']),
+            f'{r["collisions"]:.1%}',
+            *((f'{r["declared"]:.0%}', f'{r["false_stops"]:.0%}') if declared else ())])
+    return headings, lines

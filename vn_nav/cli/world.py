@@ -1,0 +1,128 @@
+"""What `vn_nav` commands share about the simulator: its options, environments, checkpoints."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import platform
+from pathlib import Path
+
+from vn_nav.errors import UserError
+
+BACKENDS = ('house',)
+
+
+def add_world(parser: argparse.ArgumentParser, defaults: bool = True) -> None:
+    """Options of the simulated world."""
+    parser.add_argument('--backend', default='house', help=f'one of: {", ".join(BACKENDS)}')
+    parser.add_argument('--house', type=int, action='append', metavar='SEED',
+                        help='seed of a house; may be given several times')
+    parser.add_argument('--rooms', type=int, default=5 if defaults else None)
+    parser.add_argument('--robot', type=Path, metavar='YAML',
+                        help='robot file (config/robots/); default: the standard robot')
+    parser.add_argument('--randomisation', default='none' if defaults else None, metavar='NAME',
+                        help='of light, camera and base: none, standard, rough or a YAML file')
+    parser.add_argument('--seed', type=int, default=0 if defaults else 10_000)
+
+
+def check_backend(name: str) -> None:
+    """Whether there is such a simulator."""
+    if name not in BACKENDS:
+        raise UserError(f'the backend is one of: {", ".join(BACKENDS)}', name, 'choose one')
+
+
+def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, threads: int = 1,
+             randomisation: str | Path = 'none', device: str = 'cpu', **options):
+    """A `NavigationEnv` of embedded houses; without a robot file with the standard robot.
+
+    On a device other than the CPU it is a `WarpNavigationEnv`.
+    """
+    from vn_nav.robot import load_robot
+    from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+    from vn_sim_bridge.render.randomisation import load_randomisation
+    config = EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs,
+                       randomisation=load_randomisation(randomisation), **options)
+    spec = load_robot(robot) if robot else None
+    if device == 'cpu':
+        return NavigationEnv(config, spec, threads=threads)
+    _check_gpu(device)
+    from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
+    return WarpNavigationEnv(config, spec, device=device)
+
+
+def _check_gpu(device: str) -> None:
+    """Whether the simulator can run on a GPU such as cuda:0."""
+    import torch
+    try:
+        import warp as wp
+    except ImportError as error:
+        raise UserError('the simulator runs on a GPU with the extra "gpu"', str(error),
+                        "pip install 'vn_nav[gpu]', or use --device cpu") from error
+    number = torch.device(device).index or 0
+    known = min(torch.cuda.device_count(), wp.get_cuda_device_count())
+    if number >= known:
+        raise UserError('the device is a GPU that torch and Warp find', f'{device}; they find '
+                        f'{known or "none"}', 'look at nvidia-smi and at torch.version.cuda, or '
+                        'use --device cpu')
+
+
+def machine(device: str = 'cpu') -> str:
+    """The processor in words, or the GPU."""
+    if device != 'cpu':
+        import torch
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+        model = next(line.split(':', 1)[1].strip() for line in lines if 'model name' in line)
+    except (OSError, StopIteration):
+        model = platform.processor() or platform.machine()
+    return f'{model}, {os.cpu_count()} cores'
+
+
+def load_for(path: Path, robot: Path | None = None):
+    """A checkpoint, and the robot with its actions.
+
+    Raises:
+        UserError: the robot has other actions or another camera.
+    """
+    from vn_nav.policy.checkpoint import load_checkpoint
+    from vn_nav.robot import RobotSpec, load_robot
+    checkpoint = load_checkpoint(path)
+    spec = load_robot(robot) if robot else RobotSpec()
+    # Or says which action is unknown, or too long.
+    spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
+    trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
+    present = math.degrees(spec.camera_fov), spec.camera_height
+    if any(abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
+        raise UserError('the robot has the camera that the policy was trained with: '
+                        f'{trained[0]:g} deg, {trained[1]:g} m high',
+                        f'{present[0]:g} deg, {present[1]:g} m (robot {spec.name})',
+                        'give its file with --robot, or train a policy for this robot')
+    return checkpoint, spec
+
+
+def load_for_house(path: Path, robot: Path | None = None):
+    """As `load_for`, of a policy that was trained in embedded houses of the present version."""
+    from vn_sim_bridge.floor.contacts import WORLD_VERSION
+    checkpoint, spec = load_for(path, robot)
+    _check_version(checkpoint.info['world_version'], WORLD_VERSION)
+    return checkpoint, spec
+
+
+def check_world(info: dict, present: str) -> None:
+    """Whether figures of a checkpoint mean something in the present world.
+
+    Pictures of a real robot, and those of several simulators, are of no world version: such a
+    policy may be tried anywhere, and any policy in such pictures.
+    """
+    from vn_nav.bags.drive import RECORDED
+    if RECORDED not in (info['world_version'], present):
+        _check_version(info['world_version'], present)
+
+
+def _check_version(trained: str, present: str) -> None:
+    if trained != present:
+        raise UserError(f'the checkpoint belongs to world version {present!r}', trained,
+                        'train it again (vn_nav train), or use the version of vn_nav that it '
+                        'came with')

@@ -1,0 +1,139 @@
+"""One self-contained HTML page about a recorded drive: figures, maps, film strips."""
+
+from __future__ import annotations
+
+import html
+import math
+from pathlib import Path
+
+import numpy as np
+
+from vn_nav import __version__
+from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
+from vn_nav.evaluation.metrics import Episode, path_efficiency
+from vn_nav.report.maps import Journey, floor_map
+from vn_nav.report.page import cards, page, picture, table
+
+STRIP = 9  # pictures of a film strip
+TITLES = {'trained': 'The house it was trained in', 'unseen': 'A house it has never seen'}
+
+
+def write_report(path: Path, drives: list[Drive], result: dict) -> None:
+    """Write the page.
+
+    Args:
+        path: of the HTML file.
+        drives: trained house, unseen house; with pictures.
+        result: the figures, as in result.json.
+    """
+    places = [(place, drive) for place, drive in zip(('trained', 'unseen'), drives, strict=True)]
+    body = ''.join(_place(place, drive, result[place]) for place, drive in places)
+    path.write_text(page('vn_nav demo', f"""
+<h1>Show a robot a picture, and it drives there</h1>
+<p class="soft">Every figure on this page was counted from the ROS 2 bag of one run: simulator and
+policy were two processes that met on ROS topics alone. The policy saw the camera, the goal picture
+and its own last action; no map, no pose, no depth.</p>
+{body}
+<h2>What the words mean</h2><dl>{_declared_stop(result['trained'])}
+<dt>Success</dt><dd>At the end of a decision the robot stands within 0.6 m of the place (driving
+distance) and faces within 30 degrees of the picture's direction. In brackets the 95 %
+interval.</dd>
+<dt>SPL</dt><dd>Success weighted by path length: 1 means that every journey succeeded on the
+shortest way.</dd>
+<dt>Collisions</dt><dd>Share of decisions that touched something. The robot does not slide along
+walls: a touch ends the movement.</dd>
+<dt>Random</dt><dd>Uniform random actions from the same starts to the same goals. Without this
+line a success rate says little.</dd></dl>
+<p class="soft">vn_nav {__version__}, checkpoint {html.escape(str(result['checkpoint']))},
+{result['date']}, {result['seconds']:.0f} s.</p>"""))
+
+
+def _declared_stop(figures: dict) -> str:
+    if 'false_stops' not in figures:
+        return ''
+    return """
+<dt>Declared stop</dt><dd>Being there is not enough: the policy itself has to say that it has
+arrived, which ends the episode. Said elsewhere it is a false stop.</dd>"""
+
+
+def _place(place: str, drive: Drive, figures: dict) -> str:
+    control = figures['random']
+    low, high = figures['success_interval']
+    stops = [(f'{figures["false_stops"]:.0%}', 'false stops',
+              f'declared {figures["declared"]:.0%}')] if 'false_stops' in figures else []
+    boxes = cards([
+        (f'{figures["success"]:.0%}', f'success ({low:.0%} to {high:.0%})',
+         f'random {control["success"]:.0%}'),
+        (f'{figures["spl"]:.2f}', 'SPL', f'random {control["spl"]:.2f}'),
+        (f'{figures["collisions"]:.1%}', 'decisions with a collision',
+         f'random {control["collisions"]:.1%}'),
+        (f'{figures["decisions"]:.0f}',
+         'decisions an episode ({:.0f} to {:.0f})'.format(*figures['decisions_interval']),
+         f'at most {figures["max_decisions"]}; random {control["decisions"]:.0f}'),
+        *stops,
+    ])
+    scene = drive.scene
+    rows = table(['goal', 'outcome', 'episode', 'start [m]', 'driven [m]', 'SPL', 'decisions',
+                  'collisions', 'stop [m]', 'stop [deg]'],
+                 [_row(recorded) for recorded in drive.episodes], text=2)
+    journeys = ''.join(_journey(recorded) for recorded in _chosen(drive.episodes))
+    stop = ' Declared stop.' if stops else ''
+    limit = '' if place == 'trained' else (
+        f' Episodes end at {figures["max_decisions"]} decisions here.')
+    return f"""<h2>{TITLES[place]}</h2>
+<p class="soft">House {scene['house']}: {len(scene['rooms_list'])} rooms, {scene['area']:.0f}
+m&sup2;, {figures['episodes']} episodes, mean start distance
+{figures['start_distance']:.1f} m.{stop}{limit}</p>
+{boxes}
+<figure>{_map(drive)}<figcaption>Dots are starts, arrows are goals with their viewing direction;
+<span class="yes">green</span> journeys arrived, <span class="no">orange</span> ones did
+not.</figcaption></figure>
+{journeys}
+<details><summary>All {len(drive.episodes)} episodes</summary>{rows}</details>"""
+
+
+def _outcome(episode: Episode) -> tuple[str, str]:
+    """The class of its colour, and words."""
+    if episode.success:
+        return 'yes', 'arrived'
+    return 'no', 'false stop' if episode.declared else 'gave up'
+
+
+def _row(recorded: RecordedEpisode) -> list[str]:
+    e = recorded.episode
+    kind, words = _outcome(e)
+    return [html.escape(e.goal), f'<span class="{kind}">{words}</span>',
+            str(recorded.facts['episode'] + 1), f'{e.start_distance:.1f}', f'{e.path_length:.1f}',
+            f'{path_efficiency(e):.2f}', str(e.decisions), str(e.collisions),
+            f'{e.stop_distance:.2f}', f'{math.degrees(e.stop_heading):.0f}']
+
+
+def _chosen(episodes: list[RecordedEpisode], most: int = 4) -> list[RecordedEpisode]:
+    """The longest successful journeys, and one that failed: nothing is hidden."""
+    with_pictures = [e for e in episodes if e.goal_picture is not None and e.pictures]
+    good = sorted((e for e in with_pictures if e.episode.success),
+                  key=lambda e: -e.episode.start_distance)
+    bad = [e for e in with_pictures if not e.episode.success]
+    return good[:most - min(1, len(bad))] + bad[:1]
+
+
+def _journey(recorded: RecordedEpisode) -> str:
+    e = recorded.episode
+    numbers = sorted(recorded.pictures)
+    picked = np.unique(np.linspace(0, len(numbers) - 1, STRIP).round().astype(int))
+    frames = ''.join(
+        f'<figure><img alt="" src="{picture(recorded.pictures[number])}">'
+        f'<figcaption>{"decision " if k == 0 else ""}{number}</figcaption></figure>'
+        for k, number in enumerate(numbers[i] for i in picked))
+    kind, words = _outcome(e)
+    return f"""<div class="journey"><h3>To the {html.escape(e.goal)}:
+<span class="{kind}">{words}</span> <small>after {e.decisions} decisions, {e.path_length:.1f} m
+for a shortest way of {e.start_distance:.1f} m</small></h3><div class="strip">
+<figure class="goal"><img alt="goal picture" src="{picture(recorded.goal_picture)}">
+<figcaption>goal picture</figcaption></figure>{frames}</div></div>"""
+
+
+def _map(drive: Drive) -> str:
+    return floor_map(drive.scene,
+                     [Journey(e.trajectory, e.episode.success) for e in drive.episodes],
+                     [goal['pose'] for goal in drive.scene['goals']])

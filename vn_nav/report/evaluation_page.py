@@ -1,0 +1,145 @@
+"""One self-contained HTML page about an evaluation: figures, controls, houses, maps."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+
+from vn_nav import __version__
+from vn_nav.evaluation.evaluator import ARRIVAL, BLANK, DECLARED, RANDOM, WRONG, Rows
+from vn_nav.evaluation.metrics import Episode
+from vn_nav.report.maps import Journey, floor_map
+from vn_nav.report.page import cards, page
+from vn_nav.report.tables import SPLITS, TITLES, rows_html, scenes_html
+
+MAPS = 6  # of a split, unless the user asks for another number
+WORDS = """<h2>What the words mean</h2><dl>
+<dt>Arrival</dt><dd>The simulator ends an episode as soon as the robot stands, at the end of a
+decision, within 0.6 m of the goal (driving distance) and faces within 30 degrees of the picture's
+direction. That is success. (Other tasks than pictures of places have rules of their own.)</dd>
+<dt>Declared stop</dt><dd>The robot has to say that it has arrived. Success needs arrival at that
+moment; a false stop ends the episode. <i>Declared</i> and <i>false stops</i> are shares of
+episodes; <i>reached</i> is the share in which the robot was at its goal at some time.</dd>
+<dt>SPL</dt><dd>Success weighted by path length: 1 means that every journey succeeded on the
+shortest way.</dd>
+<dt>Decisions, seconds, return</dt><dd>Means over episodes; time at the robot's default limits;
+undiscounted reward.</dd>
+<dt>Collisions, contact-free</dt><dd>Share of decisions that touched something; share of episodes
+that succeeded without any.</dd>
+<dt>Stop error</dt><dd>Distance and angle to the goal at the end of all episodes.</dd>
+<dt>Wrong goal, blank goal</dt><dd>The same policy on the same starts, but shown the picture of
+another place in the house, or plain grey; it is still measured at the right place. A policy that
+looks at its picture falls far behind here.</dd></dl>"""
+
+
+def evaluation_page(result: dict, measured: dict[str, Rows],
+                    plans: dict[str, dict[int, dict]], *, maps: int = MAPS) -> str:
+    """The page.
+
+    Args:
+        result: as `vn_nav evaluate --json` writes it.
+        measured: the episodes behind it, by split.
+        plans: floor plans by split and the house's seed, see `floor_map`.
+        maps: at most this many of each split.
+    """
+    body = ''.join(_split(name, split, measured[name], plans[name], result, maps)
+                   for name, split in result['splits'].items())
+    return page('vn_nav evaluate', f"""<h1>{html.escape(result['checkpoint'])}</h1>
+<p class="soft">World version {html.escape(str(result['world_version']))}, task
+{html.escape(result['task'])}, actions by the rule <i>{result['decoding']}</i>, at most
+{result['max_decisions']} decisions an episode, seed {result['seed']}. vn_nav {__version__},
+{result['date']}.</p>
+{body}
+{WORDS}""")
+
+
+def _split(name: str, split: dict, rows: Rows, plans: dict[int, dict], result: dict,
+           maps: int) -> str:
+    # The headline is the declared stop, where the policy can declare one.
+    headline = DECLARED if DECLARED in split['rows'] else ARRIVAL
+    tables = ''.join(f'<h3>{TITLES[stop]}</h3>{rows_html(own, stop)}'
+                     for stop, own in split['rows'].items())
+    scenes = ''.join(f'<h3>{TITLES[stop]}</h3>{scenes_html(split["scenes"], stop)}'
+                     for stop in split['rows'])
+    bag, limit, houses = result.get('bag'), result['max_decisions'], len(split['houses'])
+    scenes = '' if bag else f'<details><summary>By house</summary>{scenes}</details>'
+    where = f'{houses} house{"s" * (houses > 1)}' if bag is None else (
+        f'In the pictures of the drive {html.escape(bag)}')
+    own = next(iter(split['rows'][headline].values()))
+    chosen = choose(next(iter(rows[headline].values())), maps)
+    figures = ''.join(_map(episode, plans[episode.scene], limit, bag) for episode in chosen)
+    legend = ('<p class="soft">Dot: start; ring: end; blue arrow: the goal and where its picture '
+              'looks; crosses: contacts.</p>' if chosen else '')
+    return f"""<h2>{html.escape(SPLITS.get(name, name))}</h2>
+<p class="soft">{where}, {own['episodes']} episodes a row, mean start
+distance {own['start_distance']:.1f} m.</p>
+{_cards(split['rows'][headline], headline)}
+{tables}
+{scenes}
+{legend}<div class="maps">{figures}</div>"""
+
+
+def _cards(rows: dict[str, dict], stop: str) -> str:
+    own = next(iter(rows.values()))
+
+    def beside(key: str, words: str) -> str:
+        return '; '.join(f'{name} {rows[name][key]:{words}}' for name in (WRONG, BLANK, RANDOM)
+                         if name in rows)
+    low, high = own['success_interval']
+    entries = [
+        (f'{own["success"]:.0%}', f'success, {TITLES[stop].lower()} ({low:.0%} to {high:.0%})',
+         beside('success', '.0%')),
+        (f'{own["spl"]:.2f}', 'SPL', beside('spl', '.2f')),
+        (f'{own["collisions"]:.1%}', 'decisions with a collision',
+         f'{own["contact_free_success"]:.0%} succeeded without any'),
+        (f'{own["decisions"]:.0f}', 'decisions an episode', f'{own["seconds"]:.0f} s of driving'),
+    ]
+    if stop == DECLARED:
+        entries.insert(1, (f'{own["false_stops"]:.0%}', 'false stops',
+                           f'reached the goal in {own["reached"]:.0%}'))
+    return cards(entries)
+
+
+def choose(episodes: Sequence[Episode], count: int) -> list[Episode]:
+    """Episodes to show: half failures, as far as there are any; from many houses; long ways first.
+
+    Args:
+        episodes: to choose from.
+        count: how many at most.
+    """
+    def spread(kind: bool) -> list[Episode]:
+        seen: dict[int, int] = {}
+        ranked = []
+        for e in sorted(episodes, key=lambda e: -e.start_distance):
+            if e.success == kind:
+                ranked.append((seen.get(e.scene, 0), e))
+                seen[e.scene] = seen.get(e.scene, 0) + 1
+        return [e for _, e in sorted(ranked, key=lambda pair: pair[0])]
+
+    good, bad = spread(True), spread(False)
+    failures = max(min(len(bad), count // 2), count - len(good))
+    return good[:count - failures] + bad[:failures]
+
+
+def outcome(episode: Episode) -> str:
+    """How an episode ended, in words."""
+    if episode.declared is None:
+        return 'arrived' if episode.success else 'gave up'
+    if episode.declared:
+        return 'stopped at the goal' if episode.success else 'false stop'
+    return 'passed its goal and never stopped' if episode.reached else 'gave up'
+
+
+def _map(episode: Episode, plan: dict, limit: int, bag: str | None) -> str:
+    kind = 'yes' if episode.success else 'no'
+    goals = [] if episode.goal_pose is None else [episode.goal_pose]
+    drawn = floor_map(plan, [Journey(episode.trajectory, episode.success, episode.contacts)],
+                      goals)
+    count = episode.decisions
+    after = (f'after {count} decision{"s" * (count > 1)}' if count < limit
+             else f'at the limit of {limit} decisions')
+    to = 'To the' if bag else f'House {episode.scene}, to the'
+    return f"""<figure>{drawn}<figcaption>{to}
+{html.escape(episode.goal)}: <span class="{kind}">{outcome(episode)}</span> {after},
+{episode.path_length:.1f} m for a shortest way of {episode.start_distance:.1f} m; end
+{episode.stop_distance:.1f} m from the goal</figcaption></figure>"""

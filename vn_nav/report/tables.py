@@ -1,0 +1,108 @@
+"""Figures as tables: in the terminal and as HTML, from one list of columns."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Sequence
+
+from vn_nav.evaluation.evaluator import DECLARED
+from vn_nav.report.page import table
+from vn_nav.report.terminal import print_table
+
+TITLES = {'arrival': 'Arrival', 'declared': 'Declared stop'}
+SPLITS = {  # names of splits, for people
+    'houses': 'Chosen houses', 'seen_goals': 'Seen goals', 'unseen_goals': 'Unseen goals',
+    'all_goals': 'All goals',
+    'train': 'Training split', 'validation': 'Validation split', 'test': 'Test split',
+    'unseen_look': 'Unseen look',
+}
+Column = tuple[str, Callable[[dict], str]]  # heading, its words from a summary
+COLUMNS: tuple[Column, ...] = (
+    ('success (95 %)', lambda r: '{:.2f} ({:.2f}-{:.2f})'.format(r['success'],
+                                                                 *r['success_interval'])),
+    ('SPL', lambda r: f'{r["spl"]:.2f}'),
+    ('decisions (95 %)', lambda r: '{:.0f} ({:.0f}-{:.0f})'.format(r['decisions'],
+                                                                   *r['decisions_interval'])),
+    ('seconds', lambda r: f'{r["seconds"]:.0f}'),
+    ('collisions', lambda r: f'{r["collisions"]:.1%}'),
+    ('contact-free', lambda r: f'{r["contact_free_success"]:.2f}'),
+    ('stop error', lambda r: f'{r["stop_error_m"]:.2f} m {r["stop_error_deg"]:.0f} deg'),
+    ('return', lambda r: f'{r["return"]:.2f}'),
+)
+STOP_COLUMNS: tuple[Column, ...] = (
+    ('declared', lambda r: f'{r["declared"]:.2f}'),
+    ('false stops', lambda r: f'{r["false_stops"]:.2f}'),
+    ('reached', lambda r: f'{r["reached"]:.2f}'),
+)
+
+
+def place(split: str, houses: Sequence[int], bag: str | None = None) -> str:
+    """A split and its houses, or the recorded drive, in a few words."""
+    if bag is not None:
+        return f'{SPLITS[split].lower()} of {bag}'
+    if len(houses) <= 3:
+        return f'{SPLITS[split].lower()} (house {", ".join(map(str, houses))})'
+    return f'{SPLITS[split].lower()} ({len(houses)} houses)'
+
+
+def _columns(stop: str) -> tuple[Column, ...]:
+    return COLUMNS[:1] + STOP_COLUMNS + COLUMNS[1:] if stop == DECLARED else COLUMNS
+
+
+def _rows_cells(rows: dict[str, dict], stop: str) -> tuple[list[str], list[list[str]]]:
+    columns = _columns(stop)
+    return (['policy', *(heading for heading, _ in columns)],
+            [[name, *(words(figures) for _, words in columns)] for name, figures in rows.items()])
+
+
+def _scenes_cells(scenes: dict, stop: str) -> tuple[list[str], list[list[str]]]:
+    """A line a house: the policy's figures, and beside them the success of each control."""
+    columns = _columns(stop)
+    names = list(next(iter(scenes.values()))[stop])
+    lines = []
+    for seed, rows in scenes.items():
+        own, *controls = rows[stop].values()
+        lines.append([str(seed), str(own['episodes']), *(words(own) for _, words in columns),
+                      *(f'{control["success"]:.2f}' for control in controls)])
+    return ['house', 'episodes', *(heading for heading, _ in columns), *names[1:]], lines
+
+
+def row_line(name: str, figures: dict, stop: str) -> str:
+    """A row in a line, as soon as it is measured."""
+    words = [f'{heading} {shown(figures)}' for heading, shown in _columns(stop)]
+    return f'{name}: {figures["episodes"]} episodes, {", ".join(words)}'
+
+
+def print_rows(figures: dict[str, dict[str, dict]], title: str) -> None:
+    """Print the rows of a split, a table for each kind of stop.
+
+    Args:
+        figures: as of `evaluator.figures`.
+        title: of the place.
+    """
+    for stop, rows in figures.items():
+        count = next(iter(rows.values()))['episodes']
+        _print(f'{title}: {TITLES[stop].lower()}, {count} episodes each', *_rows_cells(rows, stop))
+
+
+def print_scenes(scenes: dict, title: str) -> None:
+    """Print the figures of each house; `scenes` by seed, each as for `print_rows`."""
+    for stop in next(iter(scenes.values())):
+        _print(f'{title}: {TITLES[stop].lower()}, by house', *_scenes_cells(scenes, stop))
+
+
+def _print(title: str, headings: list[str], lines: list[list[str]]) -> None:
+    first, *others = headings
+    print_table(title, [first, *(heading.replace(' ', '\n', 1).replace('-', '-\n')
+                                 for heading in others)], lines)
+
+
+def rows_html(rows: dict[str, dict], stop: str) -> str:
+    """The rows of one kind of stop as an HTML table."""
+    headings, lines = _rows_cells(rows, stop)
+    return table(headings, [[html.escape(cell) for cell in line] for line in lines], first=True)
+
+
+def scenes_html(scenes: dict, stop: str) -> str:
+    """The figures of each house, of one kind of stop, as an HTML table."""
+    return table(*_scenes_cells(scenes, stop))

@@ -1,0 +1,1 @@
+"""Pictures and pairs of pictures to learn from."""

@@ -1,0 +1,259 @@
+"""Pairs of a robot's view and a goal picture with what relates them, for supervised learning."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+
+from vn_nav.co_visibility import lift, overlap, relative_pose
+from vn_nav.errors import UserError
+from vn_nav.robot import RobotSpec
+from vn_sim_bridge.counter_random import Stream, key, uniform
+from vn_sim_bridge.houses.house import CELL, DistanceField, FloorMap
+from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.navigation import tasks
+from vn_sim_bridge.render.randomisation import Randomisation
+from vn_sim_bridge.simulator import Frames
+from vn_sim_bridge.simulators.house import HouseBackend
+
+# How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.
+NEARBY = (0.30, 4.0, math.radians(75))
+CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
+# With the goal ahead: pairs that overlap are seldom farther than a metre apart otherwise, and a
+# robot that comes into a room sees its goal from afar. The heading is off that to the goal; the
+# last angle is that of the robot's place off the line behind the goal. The rest stands anywhere.
+BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
+GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
+TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
+WINDOW = 12  # cells around a goal that a path of the arrival radius cannot leave
+
+
+class PairSampler:
+    """Independent random pairs of views in some houses.
+
+    A goal stands on a random free cell, with free floor straight ahead. A robot stands near it
+    (`NEARBY`, `CLOSE`, `BEHIND`: where it touches nothing) or anywhere in its house. Light and
+    camera of the two are drawn apart. Everything is a function of the seed and the number of the
+    draw: to go on later, keep `count` and set it again.
+
+    Args:
+        houses: seeds.
+        rooms: of each house.
+        size: side of the pictures [pixels].
+        robot: footprint and camera; the standard robot if left out.
+        randomisation: of light and camera; default: nothing varies.
+        seed: of the draws.
+        threads: threads that draw.
+    """
+
+    def __init__(self, houses: Sequence[int], rooms: int = 5, size: int = 84,
+                 robot: RobotSpec | None = None, randomisation: Randomisation | None = None,
+                 seed: int = 0, threads: int = 1):
+        if len(houses) < 1:
+            raise UserError('there is at least one house', houses, 'name their seeds')
+        self.houses = [generate_house(house, rooms=rooms) for house in houses]
+        self.count = 0  # pairs drawn so far
+        self._seed, self._size = seed, size
+        self._backend = HouseBackend(self.houses, [0], robot=robot or RobotSpec(), size=size,
+                                     threads=threads, randomisation=randomisation)
+        cells = [house.floor.centres() for house in self.houses]
+        maps = [house.floor.free for house in self.houses]
+        free = np.zeros((len(maps), *np.max([part.shape for part in maps], axis=0)), bool)
+        for part, own in zip(free, maps, strict=True):
+            part[:own.shape[0], :own.shape[1]] = own
+        rects = [house.obstacle_rects for house in self.houses]
+        self._floors = (
+            np.concatenate(cells), np.cumsum([0, *map(len, cells)]),
+            np.concatenate(rects), np.cumsum([0, *map(len, rects)]), free,
+            np.array([house.floor.origin for house in self.houses]),
+            self._backend.robot.footprint_radius)
+
+    def draw(self, count: int) -> dict[str, np.ndarray]:
+        """The next pairs.
+
+        Args:
+            count: how many, K.
+
+        Returns:
+            image, goal: [K,3,S,S] uint8.
+            goal_pose: [K,4] float32, see `overlap.relative_pose`.
+            overlap: [K] float32, see `overlap.overlap`.
+            arrived: [K] bool, by the image task's rule.
+            depth: [K,S,S] float32 m; segmentation, goal_segmentation: [K,S,S] uint8.
+            house: [K] int64, index; pose, goal_place: [K,4] float64 in the map frame.
+        """
+        if count < 1:
+            raise UserError('a draw has at least one pair', count, 'draw more')
+        numbers = np.arange(self.count, self.count + count)
+        house, poses, goal_poses = self.poses(numbers)
+        self.count += count
+        goal, goal_camera = self._look(house, goal_poses, numbers, 1)
+        points = lift(goal.depth, *goal_camera)
+        image, camera = self._look(house, poses, numbers, 0)
+        return {
+            'image': image.rgb, 'goal': goal.rgb,
+            'goal_pose': relative_pose(poses, goal_poses),
+            'overlap': overlap(points, image.depth, *camera),
+            'arrived': self.arrived(house, poses, goal_poses),
+            'depth': image.depth, 'segmentation': image.labels, 'goal_segmentation': goal.labels,
+            'house': house, 'pose': poses, 'goal_place': goal_poses,
+        }
+
+    def draw_groups(self, count: int, robots: int = 3) -> dict[str, np.ndarray]:
+        """Views in groups, each of a goal and of several robots that stand about it as in a pair.
+
+        Any two views of a group are a pair, either way round: more labels for each picture.
+
+        Args:
+            count: groups; robots: R in each.
+
+        Returns:
+            image: [V,3,S,S] uint8 of V = count * (1 + R) views, a goal before its robots.
+            depth: [V,S,S] float32 m; segmentation: [V,S,S] uint8.
+            first, second: [K] int64, views of the K = count * (1 + R) * R pairs; the second is
+                the goal.
+            goal_pose: [K,4], overlap: [K], of the pairs, as `draw` returns them.
+        """
+        if count < 1 or robots < 1:
+            raise UserError('a draw has at least one group, and that one robot', (count, robots),
+                            'draw more')
+        # The numbers of the draws go on over all robots, whatever a group's size.
+        numbers = np.arange(self.count, self.count + count * robots)
+        house, poses, goal_poses = self.poses(numbers, robots)
+        self.count += count * robots
+        size = 1 + robots
+        poses = np.concatenate([goal_poses[::robots, None], poses.reshape(count, robots, 4)], 1)
+        numbers = np.concatenate([numbers[::robots, None], numbers.reshape(count, robots)], 1)
+        views = np.tile(np.arange(size) == 0, count)  # as in `draw`: a goal is 1, a robot 0
+        poses, numbers = poses.reshape(-1, 4), numbers.reshape(-1)
+        frames, (cameras, fov) = self._look(np.repeat(house[::robots], size), poses, numbers,
+                                            views.astype(np.int64))
+        points = lift(frames.depth, cameras, fov)
+        first, second = np.nonzero(~np.eye(size, dtype=bool))
+        start = size * np.arange(count)[:, None]
+        first, second = (start + first).reshape(-1), (start + second).reshape(-1)
+        return {
+            'image': frames.rgb, 'depth': frames.depth, 'segmentation': frames.labels,
+            'first': first, 'second': second,
+            'goal_pose': relative_pose(poses[first], poses[second]),
+            'overlap': overlap(points[second], frames.depth[first], cameras[first], fov[first]),
+        }
+
+    def poses(self, numbers: np.ndarray, robots: int = 1
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Houses [K] and poses [K,4] of robots and of goals, of some draws [K].
+
+        With several `robots` as many rows in a row have the goal of their first one.
+        """
+        draws = uniform(self._seed, Stream.PAIR, numbers[:, None], 0, np.arange(3 + 5 * TRIES))
+        leader = np.arange(len(numbers)) // robots * robots
+        draws[:, 0], draws[:, 3:3 + 2 * TRIES] = draws[leader, 0], draws[leader, 3:3 + 2 * TRIES]
+        house = (draws[:, 0] * len(self.houses)).astype(np.int64)
+        poses, goal_poses = np.zeros((2, len(numbers), 4))
+        _place(draws, house, *self._floors, poses, goal_poses)
+        return house, poses, goal_poses
+
+    def arrived(self, house: np.ndarray, poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
+        """Whether robots [K,4] have arrived at goals [K,4], by the image task's rule, [K] bool.
+
+        The geodesic distance is the task's own, solved in a window around each goal that holds
+        every path as short as the arrival radius.
+        """
+        error = tasks.heading_error(poses[:, 2], goal_poses[:, 2])
+        gap = poses[:, :2] - goal_poses[:, :2]
+        distance = np.hypot(gap[:, 0], gap[:, 1])
+        # Solved distances fall short of straight ones by no more than a cell.
+        for k in np.nonzero(tasks.arrived(distance - CELL, error))[0]:
+            floor = self.houses[house[k]].floor
+            column, row = ((goal_poses[k, :2] - floor.origin) / CELL).astype(int)
+            left, low = max(column - WINDOW, 0), max(row - WINDOW, 0)
+            window = FloorMap(
+                (floor.origin[0] + left * CELL, floor.origin[1] + low * CELL),
+                np.ascontiguousarray(floor.free[low:row + WINDOW + 1, left:column + WINDOW + 1]))
+            field = DistanceField(window, *goal_poses[k, :2])
+            distance[k] = field.distance(poses[k:k + 1, :2])[0]
+        return tasks.arrived(distance, error)
+
+    def _look(self, house, poses, numbers, view: int) -> tuple[Frames, tuple]:
+        """Pictures from poses, and the cameras that took them; `view` tells the two apart."""
+        appearance = self._backend.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
+        frames = self._backend.view(house, poses, None, appearance,
+                                    key(self._seed, Stream.PAIR_SENSOR, numbers, view))
+        return frames, self._backend.cameras(poses, appearance)
+
+
+@numba.njit(cache=True)
+def _fits(x, y, house, rects, first_rect, free, origins, radius):
+    """Whether a robot can stand, and get, there."""
+    column = math.floor((x - origins[house, 0]) / CELL)
+    row = math.floor((y - origins[house, 1]) / CELL)
+    if not (0 <= row < free.shape[1] and 0 <= column < free.shape[2]
+            and free[house, int(row), int(column)]):
+        return False
+    for m in range(first_rect[house], first_rect[house + 1]):
+        dx = max(max(rects[m, 0] - x, x - rects[m, 2]), 0.0)
+        dy = max(max(rects[m, 1] - y, y - rects[m, 3]), 0.0)
+        if dx * dx + dy * dy < radius * radius:
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def _place(draws, houses, cells, first_cell, rects, first_rect, free, origins, radius, poses,
+           goal_poses):
+    """Stand goals and robots up, by uniform numbers [K,3+5*TRIES]."""
+    for k in range(len(houses)):
+        house = houses[k]
+        low, count = first_cell[house], first_cell[house + 1] - first_cell[house]
+        rest = draws[k, 3:]
+        goal = goal_poses[k]
+        for attempt in range(TRIES):
+            cell = low + int(rest[2 * attempt] * count)
+            goal[0], goal[1] = cells[cell, 0], cells[cell, 1]
+            goal[2] = (2 * rest[2 * attempt + 1] - 1) * math.pi
+            c, s = math.cos(goal[2]), math.sin(goal[2])
+            clear = True
+            for step in range(1, 6):
+                reach = GOAL_CLEARANCE * step / 5
+                if not _fits(goal[0] + c * reach, goal[1] + s * reach, house, rects, first_rect,
+                             free, origins, 0.0):
+                    clear = False
+                    break
+            if clear:
+                break
+        rest = rest[2 * TRIES:]
+        pose = poses[k]
+        kind = draws[k, 1]
+        behind = NEARBY[0] + CLOSE[0] <= kind < NEARBY[0] + CLOSE[0] + BEHIND[0]
+        if kind >= NEARBY[0] + CLOSE[0] + BEHIND[0]:
+            # Off the centre of its cell: robots stop anywhere.
+            for attempt in range(TRIES):
+                cell = low + int(rest[3 * attempt] * count)
+                pose[0] = cells[cell, 0] + (rest[3 * attempt + 1] - 0.5) * CELL
+                pose[1] = cells[cell, 1] + (rest[3 * attempt + 2] - 0.5) * CELL
+                if _fits(pose[0], pose[1], house, rects, first_rect, free, origins, radius):
+                    break
+            pose[2] = (2 * draws[k, 2] - 1) * math.pi
+            continue
+        farthest, turn = BEHIND[1], BEHIND[2]
+        if not behind:
+            farthest, turn = (NEARBY[1], NEARBY[2]) if kind < NEARBY[0] else (CLOSE[1], CLOSE[2])
+        pose[0], pose[1] = goal[0], goal[1]
+        for attempt in range(TRIES):
+            distance = farthest * rest[3 * attempt]
+            angle = 2 * math.pi * rest[3 * attempt + 1]
+            if behind:
+                distance = farthest * math.sqrt(rest[3 * attempt])  # more of the far ones
+                angle = goal[2] + math.pi + BEHIND[3] * (angle / math.pi - 1)
+            x, y = goal[0] + distance * math.cos(angle), goal[1] + distance * math.sin(angle)
+            if _fits(x, y, house, rects, first_rect, free, origins, radius):
+                pose[0], pose[1] = x, y
+                break
+        yaw = goal[2]
+        if behind and (pose[0] != goal[0] or pose[1] != goal[1]):
+            yaw = math.atan2(goal[1] - pose[1], goal[0] - pose[0])
+        yaw += (2 * draws[k, 2] - 1) * turn
+        pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi

@@ -1,0 +1,1 @@
+"""Tasks on top of any simulator: goals, episodes, rewards."""

@@ -1,0 +1,425 @@
+"""Tasks as pure functions and small classes: goals, starts, success, rewards; no pixels.
+
+| task | goal picture | success |
+|---|---|---|
+| `image` | a view in the house | at the pose it was taken from |
+| `object` | an object, taken elsewhere | within 1 m of it, wherever it was put (thesis, 5.6) |
+| `room` | a view in a room of some type | in any room of that type (thesis, 5.7) |
+| `collect` | none | none: apples +1, lemons -1 until the limit (thesis, 5.4) |
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+# The rule of arrival is part of this module for those who use tasks.
+from vn_nav.arrival import (  # noqa: F401
+    ARRIVAL_HEADING,
+    ARRIVAL_RADIUS,
+    arrived,
+    heading_error,
+    wrap_angle,
+)
+from vn_sim_bridge.counter_random import Stream, uniform
+from vn_sim_bridge.houses.house import DistanceField, Goal, House
+from vn_sim_bridge.houses.labels import LABEL
+from vn_sim_bridge.simulator import Place
+
+OBJECT_RADIUS = 1.0  # m, geodesic (thesis, 5.6)
+COLLECT_RADIUS = 0.45  # m, straight: the robot's rim touches the fruit
+VISIBLE_SHARE = 0.045  # of the picture that shows the room's objects (House3D)
+VISIBLE_STEPS = 2  # decisions in a row
+FIELDS_KEPT = 512  # of `ImageGoal`, 0.1 MB each; a thousand others take 0.7 s to solve again
+RIGHT, WRONG, BLANK = 'right', 'wrong', 'blank'
+
+# What tells a room's type, for the rule of House3D's code.
+ROOM_OBJECTS = {
+    'kitchen': ('counter', 'stove', 'fridge', 'sink', 'microwave'),
+    'bathroom': ('toilet', 'bathtub', 'shower', 'washbasin'),
+    'bedroom': ('bed', 'wardrobe', 'dresser', 'nightstand'),
+    'living_room': ('sofa', 'tv', 'tv_stand', 'coffee_table', 'fireplace', 'piano'),
+    'dining_room': ('table', 'chair'),
+    'office': ('desk', 'whiteboard', 'bookshelf'),
+    'hall': ('coat_rack', 'bench'),
+}
+
+
+def sparse_reward(success):
+    """The thesis's reward: 1 at the goal, else 0. The only one that the network may see."""
+    return np.asarray(success, np.float32)
+
+
+def shaping_reward(before, after, collided, success=False, *, progress: float, collision: float,
+                   step: float = 0.0, goal: float = 0.0):
+    """Optional terms beside the sparse reward; they never reach the network.
+
+    Args:
+        before, after: geodesic distance to the goal around the decision [m].
+        collided: [N] bool; success: [N] bool.
+        progress: reward per metre of progress; collision: reward of a contact (negative).
+        step: of a decision that does not reach the goal; goal: of one that does.
+    """
+    return (progress * (before - after) + collision * collided
+            + np.where(success, goal, step)).astype(np.float32)
+
+
+def shows_room(labels: np.ndarray, kind: str) -> np.ndarray:
+    """Whether pictures' labels [K,H,W] show enough of a room type's objects, [K] bool."""
+    wanted = [LABEL[name] for name in ROOM_OBJECTS[kind]]
+    return np.isin(labels, wanted).mean(axis=(1, 2)) >= VISIBLE_SHARE
+
+
+def draw_index(count: int, seed: int, stream: Stream, env, episode, step=0) -> int:
+    """A whole number below `count`."""
+    return int(uniform(seed, stream, env, episode, step) * count)
+
+
+def draw_goal(count: int, seed: int, env, episode) -> int:
+    """Index of an episode's goal among `count`."""
+    return draw_index(count, seed, Stream.GOAL, env, episode)
+
+
+def draw_wrong_goal(count: int, right: int, seed: int, env, episode) -> int:
+    """Another goal of the same house, for the wrong-goal control."""
+    return (right + 1 + draw_index(count - 1, seed, Stream.WRONG_GOAL, env, episode)) % count
+
+
+class Starts:
+    """Where episodes towards a goal may start (in a house: the free cells), by distance.
+
+    Args:
+        house: the house, or another place.
+        field: distances to the goal.
+        min_distance: that a start keeps from the goal [m], as long as any cell does.
+    """
+
+    def __init__(self, house: Place, field: DistanceField, min_distance: float):
+        cells, headings = house.starts()
+        distance = field.distance(cells)
+        keep = np.isfinite(distance) & (distance >= min_distance)
+        if not keep.any():
+            keep = np.isfinite(distance)
+        order = np.argsort(distance[keep], kind='stable')
+        self.cells = cells[keep][order]  # [K,2], nearest first
+        self.distances = distance[keep][order]
+        self.headings = None if headings is None else headings[keep][order]  # None: any
+
+    def draw(self, tau: float, seed: int, env, episode) -> np.ndarray:
+        """A start pose for an episode: uniform over the cells within tau of the maximum distance.
+
+        Args:
+            tau: curriculum (thesis, section 4.5): share of the largest start distance, in (0, 1].
+            seed, env, episode: counter of the random numbers.
+
+        Returns:
+            [4] x, y, yaw, pitch.
+        """
+        limit = tau * self.distances[-1]
+        count = max(int(np.searchsorted(self.distances, limit, side='right')), 1)
+        cell = draw_index(count, seed, Stream.START_CELL, env, episode)
+        yaw = ((uniform(seed, Stream.START_YAW, env, episode) * 2 - 1) * math.pi
+               if self.headings is None else self.headings[cell])
+        return np.array([*self.cells[cell], float(yaw), 0.0])
+
+
+class GoalField:
+    """One goal pose of one house: distances to it, and where episodes towards it may start."""
+
+    def __init__(self, house: Place, goal: Goal, min_distance: float):
+        self.goal = goal
+        self.field: DistanceField = house.geodesic(goal.pose[0], goal.pose[1])
+        self.starts = Starts(house, self.field, min_distance)
+
+    def start(self, tau: float, seed: int, env, episode) -> np.ndarray:
+        """A start pose, see `Starts.draw`."""
+        return self.starts.draw(tau, seed, env, episode)
+
+
+class Placed(NamedTuple):
+    """A movable object on the floor: index of its model, position [m] and yaw [rad]."""
+
+    model: int
+    x: float
+    y: float
+    yaw: float
+
+
+class View(NamedTuple):
+    """A goal picture to take: where from, and what stands in the house meanwhile."""
+
+    house: int
+    pose: tuple[float, float, float, float]
+    name: str  # of the goal, for people
+    objects: tuple[Placed, ...] = ()
+
+
+class Episode(NamedTuple):
+    """What a task decides when an episode begins."""
+
+    goal: int  # index of the view that names the true goal; -1: none
+    shown: int  # index of the view that is shown; -1: none
+    start: np.ndarray  # [4]
+    field: DistanceField | None  # to the goal
+    goal_yaw: float  # rad
+    objects: tuple[Placed, ...] = ()
+
+
+class Judgement(NamedTuple):
+    """A task's verdict on N robots after a decision."""
+
+    success: np.ndarray  # [N] bool: the episode ends well
+    reward: np.ndarray  # [N] float32, sparse
+    removed: np.ndarray  # [N,M] bool: objects that are gone now
+
+
+class Situation(NamedTuple):
+    """What a task may judge by."""
+
+    acting: np.ndarray  # [N] bool: false on rows that are being reset
+    distance: np.ndarray  # [N] geodesic, to the goal [m]
+    heading_error: np.ndarray  # [N] rad
+    poses: np.ndarray  # [N,4]
+    labels: np.ndarray  # [N,H,W] uint8, of the pictures
+    object_model: np.ndarray  # [N,M] int64; -1: absent
+    object_xy: np.ndarray  # [N,M,2] m
+    declared: np.ndarray | None = None  # [N] bool: robots that say so; None: arriving is enough
+
+
+class Task(Protocol):
+    """Goals and rewards of N environments, of which i lives in house i modulo their number."""
+
+    views: list[View]
+    models: tuple[str, ...]  # names of the objects that it places
+    objects: int  # most objects at a time
+    state: dict[str, np.ndarray]  # what changes from step to step
+
+    def begin(self, env: int, house: int, counter: tuple[int, int, int], tau: float,
+              mode: str) -> Episode:
+        """A new episode of one environment; `mode` is which goal to show."""
+
+    def judge(self, situation: Situation) -> Judgement:
+        """Success and sparse reward after a decision."""
+
+
+class _Pool:
+    """The views of each house, side by side."""
+
+    def __init__(self):
+        self.views: list[View] = []
+        self.ranges: list[tuple[int, int]] = []  # first view and their number, by house
+        self.models: tuple[str, ...] = ()
+        self.objects = 0
+        self.state: dict[str, np.ndarray] = {}
+
+    def pick(self, house: int, counter, mode: str, fixed: int | None = None) -> tuple[int, int]:
+        """The true goal's view and the shown one (-1: blank)."""
+        first, count = self.ranges[house]
+        local = draw_goal(count, *counter) if fixed is None else fixed % count
+        shown = draw_wrong_goal(count, local, *counter) if mode == WRONG else local
+        return first + local, -1 if mode == BLANK else first + shown
+
+    def nothing_removed(self, situation: Situation) -> np.ndarray:
+        """[N,M] of False."""
+        return np.zeros(situation.object_model.shape, bool)
+
+
+class ImageGoal(_Pool):
+    """To the pose from which a picture was taken (thesis, chapter 4)."""
+
+    def __init__(self, houses: Sequence[Place], num_envs: int, *, min_distance: float,
+                 fixed_goals: bool = False):
+        super().__init__()
+        self.fixed_goals, self.houses = fixed_goals, len(houses)
+        goals = []
+        for index, house in enumerate(houses):
+            self.ranges.append((len(self.views), len(house.goals)))
+            for goal in house.goals:
+                self.views.append(View(index, goal.pose, goal.room))
+                goals.append((house, goal))
+
+        @functools.lru_cache(FIELDS_KEPT)
+        def goal_field(view: int) -> GoalField:
+            return GoalField(*goals[view], min_distance)
+
+        self.goal_field = goal_field  # of a view
+
+    def begin(self, env, house, counter, tau, mode) -> Episode:
+        """Draw goal and start."""
+        goal, shown = self.pick(house, counter, mode,
+                                env // self.houses if self.fixed_goals else None)
+        entry = self.goal_field(goal)
+        return Episode(goal, shown, entry.start(tau, *counter), entry.field, entry.goal.pose[2])
+
+    def judge(self, situation) -> Judgement:
+        """Arrival at the pose, declared if it has to be."""
+        success = arrived(situation.distance, situation.heading_error) & situation.acting
+        if situation.declared is not None:
+            success &= situation.declared
+        return Judgement(success, sparse_reward(success), self.nothing_removed(situation))
+
+
+class ObjectGoal(_Pool):
+    """To within 1 m of an object that lies somewhere else in every episode (thesis, 5.6)."""
+
+    def __init__(self, houses: list[House], num_envs: int, *, models: tuple[str, ...],
+                 objects: int, pictures: int, min_distance: float, seed: int):
+        super().__init__()
+        self.houses, self.models, self.objects = houses, models, objects
+        self.min_distance = min_distance + OBJECT_RADIUS
+        self.pictures = pictures
+        for index, house in enumerate(houses):
+            self.ranges.append((len(self.views), len(models)))
+            for model, name in enumerate(models):
+                for picture in range(pictures):
+                    counter = (seed, -1 - index, model * 1000 + picture)
+                    self.views.append(_portrait(index, house, model, name, counter))
+
+    def pick(self, house, counter, mode, fixed=None) -> tuple[int, int]:
+        """As `_Pool.pick`; every object has several pictures."""
+        first, count = self.ranges[house]
+        local = draw_goal(count, *counter)
+        shown = draw_wrong_goal(count, local, *counter) if mode == WRONG else local
+        picture = draw_index(self.pictures, counter[0], Stream.GOAL_VARIANT, *counter[1:], 1)
+        right = first + local * self.pictures
+        return right, -1 if mode == BLANK else first + shown * self.pictures + picture
+
+    def begin(self, env, house, counter, tau, mode) -> Episode:
+        """Draw the target, put it and other objects somewhere, draw the start."""
+        goal, shown = self.pick(house, counter, mode)
+        target = (goal - self.ranges[house][0]) // self.pictures
+        others = [model for model in range(len(self.models)) if model != target]
+        turn = draw_index(len(others), counter[0], Stream.OBJECT_KIND, *counter[1:]) if (
+            others) else 0
+        kinds = [target, *(others[turn:] + others[:turn])[:self.objects - 1]]
+        placed = place_objects(self.houses[house], kinds, counter)
+        field = self.houses[house].geodesic(placed[0].x, placed[0].y)
+        starts = Starts(self.houses[house], field, self.min_distance)
+        return Episode(goal, shown, starts.draw(tau, *counter), field, 0.0, placed)
+
+    def judge(self, situation) -> Judgement:
+        """Close to the target."""
+        success = (situation.distance <= OBJECT_RADIUS) & situation.acting
+        return Judgement(success, sparse_reward(success), self.nothing_removed(situation))
+
+
+class RoomGoal(_Pool):
+    """Into any room of the picture's type (thesis, 5.7).
+
+    Args:
+        must_see: also require the rule of House3D's code: at least 4.5 % of the picture shows the
+            room's objects, two decisions in a row.
+    """
+
+    def __init__(self, houses: list[House], num_envs: int, *, must_see: bool,
+                 min_distance: float):
+        super().__init__()
+        self.must_see = must_see
+        self.kinds: list[str] = []  # of each view
+        self.inside: list[tuple] = []  # per house, kind: rectangles of the rooms
+        self.fields: list[tuple[DistanceField, Starts]] = []
+        self.state = {'seen': np.zeros(num_envs, np.int64), 'goal': np.zeros(num_envs, np.int64)}
+        for index, house in enumerate(houses):
+            by_kind: dict[str, list] = {}
+            for room in house.rooms:
+                by_kind.setdefault(room.kind, []).append(room)
+            rows = [(kind, rooms, goal) for kind, rooms in by_kind.items()
+                    for goal in house.goals if goal.room == rooms[0].name]
+            self.ranges.append((len(self.views), len(rows)))
+            for kind, rooms, goal in rows:
+                self.views.append(View(index, goal.pose, kind.replace('_', ' ')))
+                self.kinds.append(kind)
+                self.inside.append(tuple(room.rect for room in rooms))
+                field = DistanceField.to_rectangles(house.floor, [room.rect for room in rooms])
+                self.fields.append((field, Starts(house, field, min_distance)))
+
+    def begin(self, env, house, counter, tau, mode) -> Episode:
+        """Draw a room type and a start outside it."""
+        goal, shown = self.pick(house, counter, mode)
+        self.state['seen'][env], self.state['goal'][env] = 0, goal
+        field, starts = self.fields[goal]
+        return Episode(goal, shown, starts.draw(tau, *counter), field, 0.0)
+
+    def judge(self, situation) -> Judgement:
+        """In such a room, and seeing it if the rule asks for it."""
+        success = np.zeros(len(situation.acting), bool)
+        for n in np.nonzero(situation.acting)[0]:
+            goal = self.state['goal'][n]
+            x, y = situation.poses[n, :2]
+            inside = any(r.x0 <= x <= r.x1 and r.y0 <= y <= r.y1 for r in self.inside[goal])
+            if self.must_see:
+                sees = inside and shows_room(situation.labels[n:n + 1], self.kinds[goal])[0]
+                self.state['seen'][n] = self.state['seen'][n] + 1 if sees else 0
+                success[n] = self.state['seen'][n] >= VISIBLE_STEPS
+            else:
+                success[n] = inside
+        return Judgement(success, sparse_reward(success), self.nothing_removed(situation))
+
+
+class Collect(_Pool):
+    """Apples are good, lemons are not, nothing is shown (thesis, 5.4: SeekAvoid)."""
+
+    APPLE, LEMON = 0, 1
+
+    def __init__(self, houses: list[House], num_envs: int, *, objects: int):
+        super().__init__()
+        self.houses, self.objects = houses, objects
+        self.models = ('apple', 'lemon')
+        self.ranges = [(0, 0)] * len(houses)
+
+    def begin(self, env, house, counter, tau, mode) -> Episode:
+        """Scatter the fruit; half of it is sour."""
+        kinds = [k % 2 for k in range(self.objects)]
+        placed = place_objects(self.houses[house], kinds, counter)
+        cells = self.houses[house].floor.centres()
+        cell = cells[draw_index(len(cells), counter[0], Stream.START_CELL, *counter[1:])]
+        yaw = (uniform(counter[0], Stream.START_YAW, *counter[1:]) * 2 - 1) * math.pi
+        return Episode(-1, -1, np.array([*cell, float(yaw), 0.0]), None, 0.0, placed)
+
+    def judge(self, situation) -> Judgement:
+        """What the robot touches is eaten."""
+        gap = situation.object_xy - situation.poses[:, None, :2]
+        touched = ((np.hypot(gap[..., 0], gap[..., 1]) <= COLLECT_RADIUS)
+                   & (situation.object_model >= 0) & situation.acting[:, None])
+        value = np.where(situation.object_model == self.APPLE, 1.0, -1.0)
+        reward = (touched * value).sum(axis=1).astype(np.float32)
+        return Judgement(np.zeros(len(reward), bool), reward, touched)
+
+
+def place_objects(house: House, kinds: list[int], counter: tuple[int, int, int]
+                  ) -> tuple[Placed, ...]:
+    """Objects at free cells of a house, at least 0.8 m apart while there is room for it."""
+    seed, env, episode = counter
+    cells = house.floor.centres()
+    placed: list[Placed] = []
+    for k, kind in enumerate(kinds):
+        for attempt in range(20):
+            cell = cells[draw_index(len(cells), seed, Stream.OBJECT_PLACE, env, episode,
+                                    100 * k + attempt)]
+            if all(math.hypot(p.x - cell[0], p.y - cell[1]) >= 0.8 for p in placed):
+                break
+        yaw = float(uniform(seed, Stream.OBJECT_PLACE, env, episode, 100 * k + 50)) * 2 * math.pi
+        placed.append(Placed(kind, float(cell[0]), float(cell[1]), yaw))
+    return tuple(placed)
+
+
+def _portrait(index: int, house: House, model: int, name: str, counter) -> View:
+    """A picture of an object from 1 to 2 m, at some free place of the house."""
+    cells = house.floor.centres()
+    seed, env, episode = counter
+    for attempt in range(40):
+        (placed,) = place_objects(house, [model], (seed, env, episode * 64 + attempt))
+        gap = np.hypot(cells[:, 0] - placed.x, cells[:, 1] - placed.y)
+        near = cells[(gap >= 1.0) & (gap <= 2.0)]
+        if len(near) == 0:
+            continue
+        eye = near[draw_index(len(near), seed, Stream.OBJECT_PLACE, env, episode, 7000 + attempt)]
+        walk = house.geodesic(placed.x, placed.y).distance(eye[None])[0]
+        if walk < 1.1 * math.hypot(eye[0] - placed.x, eye[1] - placed.y) + 0.05:  # in sight
+            break
+    yaw = math.atan2(placed.y - eye[1], placed.x - eye[0])
+    return View(index, (float(eye[0]), float(eye[1]), yaw, math.radians(15)), name, (placed,))

@@ -1,0 +1,1 @@
+"""Places made of recorded pictures."""

@@ -1,0 +1,1 @@
+"""One robot that is driven by velocities in ticks."""

@@ -1,0 +1,1 @@
+"""Looking at houses: contact sheets, a walk with the keyboard."""
