@@ -14,6 +14,10 @@ PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.m
          *sorted(DOCS.glob('*.md'))]
 CARDS = sorted(ROOT.glob('models/*/README.md'))  # written by a command
 WIDTH = 100
+# A file that a page names in `code`, and those that are on their way.
+NAMED_FILE = re.compile(r'`((?:bench|config|docs|examples|launch|models|test|vn_msgs_py|vn_nav|'
+                        r'vn_sim_bridge)/[\w./-]+)`')
+COMING = {'examples/corridor.py', 'test/simulators/'}
 
 
 def module(name):
@@ -69,6 +73,13 @@ def test_every_relative_link_leads_somewhere(path):
         assert linked.exists(), f'{path.name}: {target}'
         assert linked.is_relative_to(ROOT), target
         assert not anchor or anchor in anchors(linked), f'{path.name}: {target}'
+
+
+@pytest.mark.parametrize('path', PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_file_that_a_page_names_is_there(path):
+    named = {name for name in NAMED_FILE.findall(prose(path)) if 'NAME' not in name} - COMING
+    missing = [name for name in named if not (ROOT / name).exists()]
+    assert not missing, f'{path.name}: {missing}'
 
 
 @pytest.mark.parametrize('path', [*PAGES, ROOT / 'CHANGELOG.rst'],

@@ -51,7 +51,7 @@ def test_pip_install(prefix):
             assert (share / source).read_bytes() == (ROOT / source).read_bytes(), source
     for package in ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py'):
         sources = {path.relative_to(ROOT) for path in (ROOT / package).rglob('*.py')}
-        sources.add(Path(package) / 'py.typed')  # PEP 561
+        sources.add((ROOT / package / 'py.typed').relative_to(ROOT))  # PEP 561
         installed = {path.relative_to(packages_of(prefix))
                      for path in (packages_of(prefix) / package).rglob('*.*')
                      if path.suffix in ('.py', '.typed')}
