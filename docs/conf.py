@@ -36,6 +36,7 @@ python_use_unqualified_type_names = True
 # Optional parts: their modules are described where they are not installed, too.
 autodoc_mock_imports = ['av', 'pyarrow', 'warp']
 
+highlight_language = 'none'  # of a block that names no language
 html_theme = 'furo'
 html_title = f'vn_nav {release}'
 html_static_path = ['static']
