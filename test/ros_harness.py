@@ -15,6 +15,9 @@ from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.floor.contacts import WORLD_VERSION
 
+PATIENCE = 100.0  # s for what has no limit of its own: starting a node on a loaded machine
+ASK_AGAIN = 5.0  # s after which a service that has not answered is asked again
+
 
 def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=None):
     """A small real checkpoint with seeded random weights: nearly uniform actions.
@@ -55,10 +58,31 @@ def child(module, log, *, rules=(), **parameters):
             process.wait()
 
 
-def wait_until(condition, spin, seconds=60.0):
-    """Call `spin` until the condition holds; the seconds it took."""
+def wait_until(condition, spin, seconds=PATIENCE, what=''):
+    """Call `spin` until the condition holds; the seconds it took. `what` tells of a failure."""
     begun = time.monotonic()
     while not condition():
-        assert time.monotonic() - begun < seconds, f'not within {seconds} s'
+        assert time.monotonic() - begun < seconds, f'not within {seconds} s: {what or condition}'
         spin()
     return time.monotonic() - begun
+
+
+def ask(client, request, spin, seconds=PATIENCE):
+    """The answer of a service, and how often it was asked: again where none comes.
+
+    Fast DDS finds request and answer of a service apart. A server that has not found this
+    client's reader 0.1 s after the request drops its answer ("failed to send response"), and a
+    loaded machine needs longer. What may not be done twice is to be asked of a client that has
+    had an answer before.
+    """
+    wait_until(client.service_is_ready, spin, seconds, f'{client.srv_name} is not there')
+    futures, asked = [], -math.inf
+
+    def answered():
+        nonlocal asked
+        if time.monotonic() - asked > ASK_AGAIN:
+            asked = time.monotonic()
+            futures.append(client.call_async(request))
+        return any(future.done() for future in futures)
+    wait_until(answered, spin, seconds, f'{client.srv_name} does not answer')
+    return next(future.result() for future in futures if future.done()), len(futures)
