@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import rclpy
@@ -15,7 +16,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_harness import PATIENCE, ask, wait_until
+from ros_harness import PATIENCE, ask, child, wait_until
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Bool
@@ -25,6 +26,7 @@ from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import fill_odometry, twist_to_array
 from vn_nav.nodes.qos import qos
 
+NODE = 'vn_nav.nodes.policy_node'
 CAMERA_HZ = 30.0
 ODOMETRY_HZ = 50.0
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -204,7 +206,7 @@ class FakeRobot:
         self.enable()
         wait_until(self.moving, self.spin)
 
-    def wait_for_zero(self, seconds=2.0):
+    def wait_for_zero(self, seconds=PATIENCE):
         """Spin until the last command is zero; when the first zero after the motion came."""
         wait_until(lambda: self.commands and not self.moving(), self.spin, seconds)
         first = self.commands[-1][0]
@@ -214,11 +216,14 @@ class FakeRobot:
             first = at
         return first
 
-    def says(self, words, seconds=30.0):
-        """Spin until a status has these words in its message or values; that status."""
+    def says(self, *words, seconds=PATIENCE):
+        """Spin until a status has one of these words in its message or values; that status.
+
+        A loaded machine has more than one reason to stand still: name each that is right.
+        """
         def matching():
-            return [status for status in self.statuses
-                    if words in status[2] or any(words in value for value in status[3].values())]
+            return [status for status in self.statuses if any(
+                word in text for word in words for text in (status[2], *status[3].values()))]
         begun = time.monotonic()
         while not matching():
             assert time.monotonic() - begun < seconds, (words, self.statuses[-1:])
@@ -229,6 +234,40 @@ class FakeRobot:
         """Take it off the graph."""
         self.executor.shutdown()
         self.node.destroy_node()
+
+
+@contextmanager
+def robot_and_node(checkpoint, tmp_path, *, node=None, robot=None):
+    """A fake robot beside the node as a process: (robot, process)."""
+    rclpy.init()
+    fake = FakeRobot(**(robot or {}))
+    try:
+        with child(NODE, tmp_path / 'log', checkpoint=checkpoint, **(node or {})) as process:
+            yield fake, process
+    finally:
+        fake.close()
+        rclpy.shutdown()
+
+
+@contextmanager
+def broken_node(checkpoint, tmp_path, fault, **parameters):
+    """A fake robot beside a node with a fault that is put into its process: (robot, process)."""
+    words = [f'checkpoint:={checkpoint}', *(f'{k}:={v}' for k, v in parameters.items())]
+    arguments = ['--ros-args', *(word for pair in words for word in ('-p', pair))]
+    script = f'{fault}\nimport sys\nfrom vn_nav.nodes.policy_node import main\nsys.exit(main())'
+    rclpy.init()
+    fake = FakeRobot(odometry=RELIABLE)
+    with open(tmp_path / 'log', 'w') as log:
+        process = subprocess.Popen([sys.executable, '-c', script, *arguments], stdout=log,
+                                   stderr=log, env=os.environ | {'OMP_NUM_THREADS': '1'})
+    try:
+        yield fake, process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        fake.close()
+        rclpy.shutdown()
 
 
 class OtherCamera:

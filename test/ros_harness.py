@@ -10,13 +10,13 @@ import time
 
 import torch
 
+from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.floor.contacts import WORLD_VERSION
 
 PATIENCE = 100.0  # s for what has no limit of its own: starting a node on a loaded machine
-ASK_AGAIN = 5.0  # s after which a service that has not answered is asked again
 
 
 def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=None):
@@ -70,19 +70,9 @@ def wait_until(condition, spin, seconds=PATIENCE, what=''):
 def ask(client, request, spin, seconds=PATIENCE):
     """The answer of a service, and how often it was asked: again where none comes.
 
-    Fast DDS finds request and answer of a service apart. A server that has not found this
-    client's reader 0.1 s after the request drops its answer ("failed to send response"), and a
-    loaded machine needs longer. What may not be done twice is to be asked of a client that has
-    had an answer before.
+    What may not be done twice is to be asked of a client that has had an answer before.
     """
     wait_until(client.service_is_ready, spin, seconds, f'{client.srv_name} is not there')
-    futures, asked = [], -math.inf
-
-    def answered():
-        nonlocal asked
-        if time.monotonic() - asked > ASK_AGAIN:
-            asked = time.monotonic()
-            futures.append(client.call_async(request))
-        return any(future.done() for future in futures)
-    wait_until(answered, spin, seconds, f'{client.srv_name} does not answer')
-    return next(future.result() for future in futures if future.done()), len(futures)
+    call = ServiceCall(client, request)
+    wait_until(call.is_answered, spin, seconds, f'{client.srv_name} does not answer')
+    return call.answer, call.asked

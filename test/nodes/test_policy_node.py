@@ -109,11 +109,11 @@ def test_a_declared_arrival_stands_still_and_says_so(robot, tmp_path, mode):
         robot.spin_for(1.0)
         assert len(robot.arrived) == statements, 'said once'
         robot.show_goal(1)  # another one: it takes it, looks, and says so again
-        wait_until(lambda: robot.arrived[statements:] == [False, True], robot.spin, 30)
+        wait_until(lambda: robot.arrived[statements:] == [False, True], robot.spin)
         assert robot.call(SetBool, 'enable', data=True).success
-        wait_until(lambda: robot.arrived[statements + 2:][-2:] == [False, True], robot.spin, 30)
+        wait_until(lambda: robot.arrived[statements + 2:][-2:] == [False, True], robot.spin)
         assert robot.call(SetBool, 'enable', data=False).success
-        wait_until(lambda: not robot.arrived[-1], robot.spin, 30)
+        wait_until(lambda: not robot.arrived[-1], robot.spin)
         assert robot.commands and not any(v.any() for _, v in robot.commands)
 
 
@@ -134,7 +134,7 @@ def test_signals_deliver_zero(robot, checkpoint, tmp_path, number):
         os.kill(process.pid, number)
         sent = time.monotonic()
         assert robot.wait_for_zero() - sent < 0.5
-        wait_until(lambda: process.poll() is not None, robot.spin, 30)
+        wait_until(lambda: process.poll() is not None, robot.spin)
         assert process.returncode == 0, (tmp_path / 'log').read_text()
         assert not robot.moving()
 

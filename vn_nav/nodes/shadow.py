@@ -47,6 +47,7 @@ from vn_nav.nodes.policy_node import SHADOW_LIMIT
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.service_call import ServiceCall
 
 DOMAINS = range(215, 233)  # beyond those that people choose; they leave Linux's ports alone
 ALONE = 3.0  # s in which others on a domain are heard of, also on a busy machine
@@ -382,9 +383,9 @@ class _Stage:
         self._until(lambda: self._statements > said, 'that it does not stand there any more')
 
     def _enable(self) -> tuple[bool, str]:
-        future = self._enabler.call_async(SetBool.Request(data=True))
-        self._until(future.done, 'an answer of ~/enable')
-        return future.result().success, future.result().message
+        call = ServiceCall(self._enabler, SetBool.Request(data=True))
+        self._until(call.is_answered, 'an answer of ~/enable')
+        return call.answer.success, call.answer.message
 
     def _show(self, data: bytes, stamp: int) -> None:
         self._picture_stamp = max(stamp, self._picture_stamp + RESOLUTION)
