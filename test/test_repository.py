@@ -35,6 +35,7 @@ def targets():
     return set(phony.group(1).split())
 
 
+@pytest.mark.slow
 def test_every_source_is_good_for_the_python_versions_to_come():
     """Compiled by the Python that runs, warnings as errors; no module that later ones lack.
 
