@@ -19,15 +19,15 @@ from vn_sim_bridge.floor.contacts import WORLD_VERSION
 PATIENCE = 100.0  # s for what has no limit of its own: starting a node on a loaded machine
 
 
-def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=None):
+def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=None, **fields):
     """A small real checkpoint with seeded random weights: nearly uniform actions.
 
     With `arrival` it has that head, which says this probability of whatever it sees.
     """
     torch.manual_seed(seed)
-    network = Policy(NetworkConfig(actions=DRIVE_ACTIONS, size=size, channels=(4, 4, 4),
-                                   features=16, hidden=16,
-                                   heads=() if arrival is None else ('arrival',)))
+    network = Policy(NetworkConfig(**{
+        'actions': DRIVE_ACTIONS, 'size': size, 'channels': (4, 4, 4), 'features': 16,
+        'hidden': 16, 'heads': () if arrival is None else ('arrival',), **fields}))
     if arrival is not None:
         layer = network.heads['arrival'].out
         torch.nn.init.zeros_(layer.weight)

@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 
 from vn_msgs_py.motion import yaw_to_quaternion
-from vn_nav.bags.drive import (
-    MISFIT,
-    Cutter,
-    Heard,
-    Report,
-    integrate,
-    synchronise,
-)
+from vn_nav.bags.drive import MISFIT, Cutter, Report, integrate, synchronise
+from vn_nav.bags.drive import TimestampedMessage as Message
 from vn_nav.bags.roles import TYPES, Topics, full_name, load_topics
 from vn_nav.bags.stamped import Stamped
 from vn_nav.errors import UserError
@@ -69,9 +63,9 @@ def drive(commands, *, rate=30.0, start=10.0, odometry_rate=50.0, offset=0.0):
     def where(t):
         return path[min(int(np.searchsorted(times, t)), len(path) - 1)][1]
     end = times[-1]
-    messages = [Heard('/odom', odometry(t, *where(t)), t + offset)
+    messages = [Message('/odom', odometry(t, *where(t)), t + offset)
                 for t in np.arange(start - 0.1, end + 0.1, 1 / odometry_rate)]
-    messages += [Heard('/image_raw', picture(t), t + offset + 0.02)
+    messages += [Message('/image_raw', picture(t), t + offset + 0.02)
                  for t in np.arange(start, end, 1 / rate)]
     return sorted(messages, key=lambda heard: heard.time), where
 
@@ -97,9 +91,9 @@ def test_every_picture_gets_the_pose_of_its_own_stamp():
 
 
 def test_yaw_is_interpolated_the_short_way_round():
-    messages = [Heard('/odom', odometry(1.0, 0, 0, math.pi - 0.02), 1.0),
-                Heard('/image_raw', picture(1.02), 1.02),
-                Heard('/odom', odometry(1.04, 0, 0, -math.pi + 0.02), 1.04)]
+    messages = [Message('/odom', odometry(1.0, 0, 0, math.pi - 0.02), 1.0),
+                Message('/image_raw', picture(1.02), 1.02),
+                Message('/odom', odometry(1.04, 0, 0, -math.pi + 0.02), 1.04)]
     (frame,), _ = frames_of(messages)
     assert abs(abs(frame.pose[2]) - math.pi) < 1e-6
 
@@ -118,7 +112,7 @@ def test_pictures_without_odometry_near_them_are_dropped_and_counted():
 def test_late_and_repeated_pictures_are_left_out():
     messages, _ = drive([(0.3, 0.0, 1.0)])
     pictures = [m for m in messages if m.topic == '/image_raw']
-    again = Heard('/image_raw', pictures[3].message, pictures[9].time)
+    again = Message('/image_raw', pictures[3].message, pictures[9].time)
     at = messages.index(pictures[9])
     frames, report = frames_of(messages[:at] + [again] + messages[at:])
     assert report.unordered == 1 and len(frames) == len(pictures)
@@ -126,7 +120,7 @@ def test_late_and_repeated_pictures_are_left_out():
 
 def test_depth_belongs_to_the_picture_of_its_stamp():
     messages, _ = drive([(0.3, 0.0, 2.0)], rate=10.0)
-    depths = [Heard('/depth/image_raw', picture(m.message.header.stamp.sec
+    depths = [Message('/depth/image_raw', picture(m.message.header.stamp.sec
                     + m.message.header.stamp.nanosec * 1e-9 + 0.004), m.time + 0.3)
               for m in messages if m.topic == '/image_raw'][:-1]
     frames, _ = frames_of(sorted(messages + depths, key=lambda heard: heard.time))
@@ -139,9 +133,9 @@ def test_depth_belongs_to_the_picture_of_its_stamp():
 def test_episodes_end_where_they_are_said_to_where_the_goal_changes_and_at_gaps_and_jumps():
     messages, _ = drive([(0.3, 0.0, 6.0)])
     end, goal = SimpleNamespace(data=1), 0.0
-    events = [Heard('/goal_image', picture(5.0), 10.0), Heard('/episode_end', end, 11.0),
-              Heard('/goal_image', picture(5.0), 12.0),  # the same goal again: nothing new
-              Heard('/goal_image', picture(6.0), 13.0)]
+    events = [Message('/goal_image', picture(5.0), 10.0), Message('/episode_end', end, 11.0),
+              Message('/goal_image', picture(5.0), 12.0),  # the same goal again: nothing new
+              Message('/goal_image', picture(6.0), 13.0)]
     frames, report = frames_of(sorted(messages + events, key=lambda heard: heard.time))
     first = [next(f.time for f in frames if f.episode == k) for k in range(report.episodes)]
     assert report.episodes == 3 and report.jumps == 0
@@ -150,7 +144,7 @@ def test_episodes_end_where_they_are_said_to_where_the_goal_changes_and_at_gaps_
     assert goal[0] == 5 and goal[-1] == 6
     quiet = [m for m in messages if m.topic == '/odom' or not 12.0 < m.time < 13.5]
     assert frames_of(quiet)[1].episodes == 2
-    moved = [m if m.time < 12.0 or m.topic != '/odom' else Heard(
+    moved = [m if m.time < 12.0 or m.topic != '/odom' else Message(
         m.topic, odometry(m.message.header.stamp.sec + m.message.header.stamp.nanosec * 1e-9,
                           m.message.pose.pose.position.x + 3.0, 0.0, 0.0), m.time)
              for m in messages]
@@ -160,9 +154,9 @@ def test_episodes_end_where_they_are_said_to_where_the_goal_changes_and_at_gaps_
 def test_velocities_stand_in_for_odometry_and_are_not_believed_for_ever():
     topics = Topics().within(typed(image='/image_raw', command='/cmd_vel'))
     assert topics.odometry == ''
-    messages = [Heard('/cmd_vel', twist(0.4, 0.0), t) for t in np.arange(1.0, 2.0, 0.1)]
-    messages += [Heard('/cmd_vel', twist(math.nan, 0.0), 1.55)]
-    messages += [Heard('/image_raw', picture(t), t) for t in np.arange(1.0, 4.0, 0.1)]
+    messages = [Message('/cmd_vel', twist(0.4, 0.0), t) for t in np.arange(1.0, 2.0, 0.1)]
+    messages += [Message('/cmd_vel', twist(math.nan, 0.0), 1.55)]
+    messages += [Message('/image_raw', picture(t), t) for t in np.arange(1.0, 4.0, 0.1)]
     frames, report = frames_of(sorted(messages, key=lambda heard: heard.time), topics)
     assert report.bad == 1
     # It drives for 0.9 s between commands, and half a second beyond the last.
@@ -222,8 +216,8 @@ def test_topics_are_found_by_role_and_renamed_by_a_file(tmp_path):
 
 
 def test_what_is_held_is_bounded_when_odometry_ends():
-    messages = [Heard('/odom', odometry(t, 0.0, 0.0, 0.0), t) for t in np.arange(0.9, 1.1, 0.02)]
-    messages += [Heard('/image_raw', picture(t), t) for t in np.arange(1.0, 60.0, 0.1)]
+    messages = [Message('/odom', odometry(t, 0.0, 0.0, 0.0), t) for t in np.arange(0.9, 1.1, 0.02)]
+    messages += [Message('/image_raw', picture(t), t) for t in np.arange(1.0, 60.0, 0.1)]
     report, ahead = Report(), []
 
     def watched():
@@ -276,7 +270,7 @@ def test_takes_whose_stamps_overlap_keep_their_own_poses(back):
 
 def test_depth_obeys_the_same_clock():
     one, other = reset([(0.3, 0.0, 3.0)], [(0.3, 0.0, 3.0)], offset=3.3)
-    depths = [Heard('/depth/image_raw', m.message, m.time + 0.02)
+    depths = [Message('/depth/image_raw', m.message, m.time + 0.02)
               for m in one + other if m.topic == '/image_raw']
     frames, _ = frames_of(sorted(one + other + depths, key=lambda heard: heard.time))
     assert len(frames) == 180 and all(f.depth is f.image for f in frames)
@@ -299,7 +293,7 @@ def test_the_clock_of_the_recorder_may_be_set_back_too():
     frames, report = frames_of(one + other)
     assert len(frames) == 210 and report.set_back == 1 and report.episodes == 2
     topics = Topics().within(typed(image='/image_raw', command='/cmd_vel'))
-    takes = [Heard(topic, message, t) for start, stop in ((1.0, 4.0), (1.0, 3.0))
+    takes = [Message(topic, message, t) for start, stop in ((1.0, 4.0), (1.0, 3.0))
              for t in np.arange(start, stop, 0.1)
              for topic, message in (('/cmd_vel', twist(0.4, 0.0)), ('/image_raw', picture(t)))]
     frames, report = frames_of(takes, topics)
@@ -340,6 +334,28 @@ def test_a_role_whose_topic_has_another_type_is_refused_with_one_that_has_it(rol
     with pytest.raises(UserError) as error:
         Topics(**names).within(held | {'/other': TYPES[role][0]})
     assert '/other' in error.value.remedy and '--topics' in error.value.remedy
+
+
+@pytest.mark.parametrize('role, other', [('odometry', 'command'), ('command', 'odometry')])
+def test_odometry_and_commands_stand_in_for_each_other(tmp_path, role, other):
+    wrong = {f'/{role}': 'geometry_msgs/msg/PoseStamped'}
+    names = {'image': '/image', 'odometry': '/odometry', 'command': '/command'}
+    with pytest.raises(UserError, match=f'the {role} of a bag is') as error:
+        Topics(**names).within(typed(image='/image', **{other: f'/{other}'}) | wrong)
+    assert f'`{role}: null`' in error.value.remedy and '--topics' in error.value.remedy
+    (tmp_path / 'topics.yaml').write_text(''.join(
+        f'{known}: {name}\n' for known, name in names.items() if known != role)
+        + f'{role}: null\n')  # as it says
+    left = load_topics(tmp_path / 'topics.yaml').within(
+        typed(image='/image', **{other: f'/{other}'}) | wrong)
+    assert getattr(left, role) == '' and getattr(left, other) == f'/{other}'
+    with pytest.raises(UserError, match=f'the {role} of a bag is') as error:  # nothing stands in
+        Topics(**names).within(typed(image='/image') | wrong)
+    assert 'null' not in error.value.remedy
+    with pytest.raises(UserError) as error:
+        Topics(**names).within(typed(image='/image') | wrong | {
+            f'/{other}': 'geometry_msgs/msg/PoseStamped'})
+    assert 'null' not in error.value.remedy
 
 
 def test_types_without_msg_are_the_same_types_and_a_role_can_be_left_out(tmp_path):

@@ -16,6 +16,7 @@ from vn_nav.evaluation.evaluator import (
 )
 from vn_nav.evaluation.metrics import Episode
 from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.report import tables
 from vn_nav.report.evaluation_page import choose, evaluation_page, outcome
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
@@ -94,6 +95,36 @@ def test_houses_add_up_to_the_total():
         touched = sum(part['collisions'] * part['decisions'] for part in parts)
         assert touched / sum(part['decisions'] for part in parts) == pytest.approx(
             whole['collisions'])
+
+
+def test_how_often_the_action_filter_acts_is_a_figure():
+    """Of the policy's rows, and only where it has a filter; a shown page and tables say it."""
+    network = make_network(heads=('goal_pose',), pose_to_memory=True,
+                           moves=RobotSpec().with_actions(DRIVE_ACTIONS).moves)
+    env = make_env(limit=30)
+    actor, counted = PolicyActor(env, network, 'sample', 0), []
+
+    def spy(observation, reset):
+        actions = actor(observation, reset)
+        counted.append(actor.filtered)
+        spy.filtered = actor.filtered
+        return actions
+    episodes = run_episodes(env, spy, 6, seed=1, robot=RobotSpec())
+    total = np.sum([episode.filtered for episode in episodes], axis=0)
+    assert 0 < total[1] < total[0] <= sum(rows[0].sum() for rows in counted)
+    assert total[0] < sum(episode.decisions for episode in episodes)
+    rows = measure(functools.partial(make_env, limit=30), network, [7], decoding='sample',
+                   episodes=6, controls=('random actions',))
+    own = figures(rows)['arrival']
+    shares = own['right goal, sample']
+    assert 0 < shares['filter_changed'] < shares['filter_acted'] < 1
+    assert 'filter_acted' not in own['random actions']
+    assert f'filter acted {shares["filter_acted"]:.1%}' in tables.row_line('own', shares,
+                                                                           'arrival')
+    assert 'filter changed' in tables.rows_html(own, 'arrival')
+    without = measure(functools.partial(make_env, limit=10), make_network(), [7],
+                      decoding='sample', episodes=6, controls=())
+    assert 'filter' not in tables.rows_html(figures(without)['arrival'], 'arrival')
 
 
 def test_many_houses_are_measured_in_parts(monkeypatch):

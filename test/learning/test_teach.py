@@ -25,6 +25,9 @@ from small_bags import (
     picture,
     serialised,
 )
+from vn_nav.cli.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.cli.teaching import OWN
+from vn_sim_bridge.teach_place_place import draw_map, held_out, make_env, make_pairs
 
 from vn_msgs_py.topics import topic
 from vn_nav.bags.mapping.pose_graph import between, compose
@@ -34,8 +37,6 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.presets import preset
 from vn_nav.learning.stages import Stages
-from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
-from vn_nav.learning.teaching import OWN
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -45,7 +46,6 @@ from vn_sim_bridge.recorded.image_graph import build_graph
 from vn_sim_bridge.robot.joystick import Joystick
 from vn_sim_bridge.robot.simulated_robot import TICK
 from vn_sim_bridge.simulators.house import HouseBackend
-from vn_sim_bridge.teach_place import draw_map, held_out, make_env, make_pairs
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 SIZE = 36

@@ -87,6 +87,12 @@ def test_how_two_policies_differ_is_counted():
     rows = dict(figures(found))
     assert rows['of them the same'] == '33.3%' and rows['arrived'] == 'old 2, new 0, both 0'
     assert '1.00 to 3.00 s (episode 0)' in rows['the first']
+    assert 'action filter' not in rows
+    a.filtered = {'decisions': 6, 'acted': 4, 'changed': 1}
+    found = compare(a, b, ('old', 'new'), ([], []))
+    assert json.loads(as_json(found))['filtered'] == {'a': a.filtered, 'b': None}
+    assert dict(figures(found))['action filter'] == (
+        'old acted at 4 of 6 decisions, changed 1; new none')
     text = markdown(found)
     assert '| forward | 2 | 2 |' in text and r'mean \|dv\|' in text
 
@@ -315,6 +321,24 @@ def test_the_node_says_along_a_bag_what_the_policy_says_without_ros(tmp_path, ca
     # Again, and the same.
     assert main([*arguments, '--out', str(tmp_path / 'again')]) == 0
     assert said_in(tmp_path / 'again') == said_in(tmp_path / 'both' / 'a')
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_node_acts_behind_the_filter_and_says_how_often(tmp_path, capfd):
+    """In its diagnostics, and in the report: what `PolicyRuntime` counts on the same drive."""
+    checkpoint = write_checkpoint(tmp_path / 'policy', heads=('goal_pose',), pose_to_memory=True,
+                                  moves=ROBOT.moves)
+    assert main(['bag', 'drive', str(FIXTURE), '--robot', str(BASE), '--checkpoint',
+                 str(checkpoint), '--out', str(tmp_path / 'out')]) == 0
+    said, shadow = capfd.readouterr().out, read_shadow(tmp_path / 'out')
+    runtime = PolicyRuntime(checkpoint)
+    expected = alone(runtime, load_drives(FIXTURE, Wanted(ROBOT), tmp_path / 'cache'), ROBOT)
+    assert [answer.choice for answer in shadow.answers] == expected
+    assert shadow.filtered == dataclasses.asdict(runtime.filter_counts)
+    assert shadow.filtered['decisions'] == len(expected)
+    assert f'acted at {shadow.filtered["acted"]} of {len(expected)} decisions' in said
 
 
 @pytest.mark.ros

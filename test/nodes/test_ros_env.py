@@ -20,11 +20,11 @@ from rclpy.executors import SingleThreadedExecutor
 from ros_harness import PATIENCE, child, wait_until
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Bool, UInt8
+from vn_nav.bags.doctor.checks.checks import diagnose
 
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import fill_odometry, twist_to_array
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.drive import integrate
 from vn_nav.cli import main
 from vn_nav.cli.train import config_over_ros

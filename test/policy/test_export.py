@@ -14,6 +14,7 @@ from vn_nav.policy.checkpoint import LoadedCheckpoint, save_checkpoint
 from vn_nav.policy.checkpoint_info import INFO
 from vn_nav.policy.export import OPSET, export_onnx
 from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 onnx = pytest.importorskip('onnx', reason='expected: onnx, of the extra `onnx`, is not installed')
@@ -147,11 +148,39 @@ def test_the_files_describe_themselves(tmp_path):
         assert [part.version for part in model.opset_import] == [OPSET]
 
 
+@pytest.mark.parametrize('name, filtered', [('matching', True), ('fused', False)])
+def test_the_example_beside_the_files_acts_as_the_runtime_does(name, filtered, tmp_path,
+                                                               monkeypatch):
+    network = network_of(name)
+    network.actor.weight.data *= 0.01
+    network.actor.bias.data = torch.tensor([9.0, 6.0, 3.0, 0.0])  # at a wall: forward again
+    facts = {**FACTS, 'stop_threshold': None}
+    save_checkpoint(tmp_path / 'checkpoint', network, facts)
+    session = exported(network, tmp_path / 'onnx', **facts)['policy']
+    told = session.get_modelmeta().custom_metadata_map
+    assert told['action_filter'] == ('blocked_actions' if filtered else 'none')
+    assert len(json.loads(told['moves'])) == (len(DRIVE_ACTIONS) if filtered else 0)
+    card = (tmp_path / 'onnx' / 'README.md').read_text()
+    assert ('behind it' in card) == ('BlockedActionFilter' in card) == filtered
+    picture, goal = np.random.default_rng(0).integers(0, 256, (2, 3, 64, 64), np.uint8)
+    monkeypatch.chdir(tmp_path / 'onnx')
+    scope = {'goal_picture': goal[None]}
+    exec(card.split('```python')[1].split('```')[0], scope)
+    runtime = PolicyRuntime(tmp_path / 'checkpoint', decoding='greedy')
+    runtime.set_goal(goal)
+    last, acted = -1, []
+    for _ in range(5):
+        last = int(scope['decide'](picture[None], last).argmax())
+        acted.append(last)
+        assert last == runtime.act(picture)
+    assert acted == ([0, 1, 2, 0, acted[4]] if filtered else [0] * 5)
+
+
 def test_a_policy_that_looks_at_no_goal_has_no_model_of_it(tmp_path):
     assert set(exported(network_of('fused'), tmp_path)) == {'policy', 'goal'}
     sessions = exported(network_of('unreal'), tmp_path, stop_threshold=None)
     assert set(sessions) == {'policy'}
-    assert {path.name for path in tmp_path.iterdir()} == {'policy.onnx'}
+    assert {path.name for path in tmp_path.iterdir()} == {'policy.onnx', 'README.md'}
     assert sessions['policy'].get_modelmeta().custom_metadata_map['stop_threshold'] == ''
 
 

@@ -10,20 +10,20 @@ import pytest
 import torch
 from corridor_drive import ROBOT, SIZE, corridor_graph
 from torch.nn import functional as F
+from vn_nav.cli.teaching import _widened
+from vn_sim_bridge.teach_place_place import make_views, regrets
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import imitation_loss
 from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spots
-from vn_nav.learning.teaching import _widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import NetworkConfig, Policy
-from vn_nav.policy.places import HEADINGS, LookAround
+from vn_nav.policy.places import HEADINGS, MultiViewAveraging
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.datasets.recorded_views import GraphViews
 from vn_sim_bridge.recorded.pose_lattice import MOST
 from vn_sim_bridge.recorded.relight import draw_light, relight
 from vn_sim_bridge.simulators.recorded import ImageGraphBackend
-from vn_sim_bridge.teach_place import make_views, regrets
 
 SIDE = 36
 CONFIG = NetworkConfig(actions=ROBOT.action_names, size=SIDE, channels=(8, 8, 8), features=16,
@@ -159,7 +159,7 @@ def test_imitation_reaches_what_is_acted_upon():
 
 
 def test_who_turns_on_the_spot_knows_it_by_all_its_pictures():
-    around = LookAround(((0.5, 0, 0), (-0.2, 0, 0), (0, 0, 0.5), (0, 0, -0.5)), 3)
+    around = MultiViewAveraging(((0.5, 0, 0), (-0.2, 0, 0), (0, 0, 0.5), (0, 0, -0.5)), 3)
     here = torch.rand(7, 1, 3 + HEADINGS)
     actions = torch.tensor([-1, 2, 3, 0, 2, 2, 3])[:, None]
     starts = torch.tensor([True, False, False, False, False, True, False])[:, None]

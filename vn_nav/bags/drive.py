@@ -44,7 +44,7 @@ def find_topics(bag: str | Path, wanted: Topics) -> Topics:
     return wanted.within({name: topic.type for name, topic in summary(bag).items()})
 
 
-def hear(bag: str | Path, topics: Topics) -> Iterator[Heard]:
+def hear(bag: str | Path, topics: Topics) -> Iterator[TimestampedMessage]:
     """The messages of a drive in the order of recording, one take after the other.
 
     Args:
@@ -56,10 +56,10 @@ def hear(bag: str | Path, topics: Topics) -> Iterator[Heard]:
     """
     names = tuple(filter(None, dataclasses.astuple(topics)))
     for m in messages(bag, names, clocks=(topics.image, topics.odometry or topics.command)):
-        yield Heard(m.topic, m.message, m.time)
+        yield TimestampedMessage(m.topic, m.message, m.time)
 
 
-class Heard(NamedTuple):
+class TimestampedMessage(NamedTuple):
     """A message of a bag, in the order of recording."""
 
     topic: str
@@ -102,7 +102,8 @@ class Report:
         return self.misfits / max(self.misfits + sum(self.actions.values()), 1)
 
 
-def synchronise(messages: Iterable[Heard], topics: Topics, report: Report) -> Iterator[Frame]:
+def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: Report
+                ) -> Iterator[Frame]:
     """Camera pictures with their poses, in order, one episode after the other.
 
     Poses are interpolated between the odometry before and after a picture, if the nearer of the
@@ -218,7 +219,7 @@ class _DeadReckoning:
         self._pose = np.zeros(3)
         self._velocity = np.zeros(3)
         self._from = -math.inf  # when the velocity was heard
-        self._at = None  # time of the pose
+        self._at: float | None = None  # time of the pose
         self._past: collections.deque[tuple[float, np.ndarray]] = collections.deque()
 
     def hear(self, message: Any, time: float) -> None:
@@ -312,6 +313,7 @@ class Cutter:
         yield from self._end()
 
     def _go_on(self, frame: Frame) -> Iterator[Step]:
+        assert self._begin is not None  # `cut` began with a frame
         moved = _relative(self._begin.pose, frame.pose)
         action, misfit = self._fit(moved)
         if misfit < (math.inf if self._best is None else self._best[0]):
@@ -329,6 +331,7 @@ class Cutter:
 
     def _finish(self) -> Iterator[Step]:
         """End the action where it fitted best, and go on from there."""
+        assert self._best is not None  # else there is no end
         _, action, end = self._best
         rest, self._since, self._best = self._since, [], None
         yield self._step(action, end)
@@ -336,6 +339,7 @@ class Cutter:
             yield from self._go_on(frame)
 
     def _step(self, action: int, end: Frame) -> Step:
+        assert self._begin is not None  # an action ends that began there
         step = Step(self._begin, action, False)
         if action == MISFIT:
             self._report.misfits += 1
@@ -347,7 +351,7 @@ class Cutter:
     def _end(self) -> Iterator[Step]:
         while self._best is not None:
             yield from self._finish()
-        if self._begin is not None:
+        if self._begin is not None and self._last is not None:
             # What is left over is a motion of its own, unless it is next to none.
             moved = np.abs(_relative(self._begin.pose, self._last.pose)) / self._unit
             if moved.max() >= MIXED:

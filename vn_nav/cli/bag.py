@@ -74,7 +74,7 @@ def _add_drive(parser: argparse.ArgumentParser) -> None:
 
 def run_doctor(args) -> int:
     """`vn_nav bag doctor`: 0 where the bag can be used, 1 where it cannot."""
-    from vn_nav.bags.doctor.checks import diagnose
+    from vn_nav.bags.doctor.checks.checks import diagnose
     from vn_nav.bags.roles import load_topics
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise UserError('a file is written into a folder that exists', str(args.json),
@@ -94,7 +94,7 @@ def run_doctor(args) -> int:
 
 def run_recover(args) -> int:
     """`vn_nav bag recover`: 0, with what was lost told; if strict, 2 where something was."""
-    from vn_nav.bags.doctor.recover import recover
+    from vn_nav.bags.doctor.checks.recover import recover
     recovered = recover(args.bag, args.out)
     print('\n'.join(recovered.lines()))
     return 2 if args.strict and recovered.lost else 0
@@ -185,6 +185,8 @@ def _print(diagnosis) -> None:
         style = 'bold red' if finding.severity == 'error' else 'yellow'
         console.print(Text.assemble((f'{finding.severity}: ', style), f'{where} '
                                     f'{finding.what}{first}; {finding.remedy}'))
+    for note in diagnosis.notes:
+        console.print(Text(f'note: {note}'))
     if not diagnosis.findings:
         console.print(Text.assemble(('ok: ', 'green'), 'nothing is wrong with it'))
 

@@ -1,7 +1,7 @@
 """`vn_nav teach`: a policy for the place where a bag was driven, learned in the bag's pictures.
 
 The simulator's half, which makes a place out of pictures with poses, comes from the caller
-(`vn_sim_bridge.teach_place`).
+(`vn_sim_bridge.teach_place_place`).
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ import math
 from pathlib import Path
 
 from vn_nav.bags.mapping.recorded_place import add_place_options, check_place_options, read_place
+from vn_nav.cli.teaching import PRESET, SEARCHED, Place, Teaching
 from vn_nav.cli.train import CHANGES, train_config
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
-from vn_nav.learning.teaching import PRESET, SEARCHED, Place, Teaching
 from vn_nav.learning.trainer import STATE
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
 
@@ -126,7 +127,9 @@ def _config(args: argparse.Namespace, given: LoadedCheckpoint | None, minutes: f
             raise UserError('an encoder that learns is taught', f'{args.checkpoint}, whose '
                             'encoder is frozen', 'choose another --checkpoint')
         own |= {'pair_minutes': 0.0, 'stacked_frames': network.frames,
-                'track_goal': bool(network.moves), **{name: getattr(network, name) for name in (
+                'track_goal': bool(network.moves),
+                'action_filter': network.filter_name != NONE or not network.moves,
+                **{name: getattr(network, name) for name in (
                     'architecture', 'channels', 'blocks', 'features', 'hidden', 'deconvolutions',
                     'pose_to_memory', 'pixel_mean', 'pixel_std')}}
     words = [f'{name}={value}' for name, value in own.items()]

@@ -29,7 +29,8 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
 
     Args:
         env: as `NavigationEnv`; its rewards should be the sparse ones.
-        actor: chooses the actions.
+        actor: chooses the actions; what it says in an attribute `filtered`, as `PolicyActor` has
+            it, is counted.
         episodes: at least this many; rounded up to the same number in each environment.
         seed: of the environment: equal seeds give equal starts.
         robot: for the duration of actions at its default limits.
@@ -46,6 +47,7 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
     poses = _goal_poses(env)
     found: list[list[Episode]] = [[] for _ in range(count)]
     collisions, seconds, reward = np.zeros(count, int), np.zeros(count), np.zeros(count)
+    filtered = np.zeros((2, count), int)
     reached = np.zeros(count, bool)
     observation, info = env.reset(seed=seed)
     paths = [[pose[:3]] for pose in info['pose']]
@@ -55,6 +57,9 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
         actions = actor(observation, info['reset'])
         observation, rewards, terminated, truncated, info = env.step(actions)
         acting = ~info['reset']
+        behind_filter = getattr(actor, 'filtered', None)  # random actions and oracle have none
+        if behind_filter is not None:
+            filtered += behind_filter & acting
         collisions += info['collided'] & acting
         seconds += np.where(acting, durations[actions], 0)
         reward += rewards
@@ -65,7 +70,7 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
             paths[n].append(info['pose'][n, :3])
             if info['collided'][n]:
                 contacts[n].append(info['pose'][n, :2])
-        for n in np.nonzero(terminated | truncated)[0]:
+        for n in np.nonzero(terminated | truncated)[0].tolist():
             found[n].append(Episode(
                 success=bool(info['success'][n]), start_distance=float(info['start_distance'][n]),
                 path_length=float(info['path_length'][n]), decisions=int(info['decisions'][n]),
@@ -76,10 +81,13 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
                 scene=int(env.houses[env.house_index[n]].seed),
                 declared=(None if env.declare_action is None
                           else bool(actions[n] == env.declare_action)),
-                reached=bool(reached[n]), trajectory=np.array(paths[n]),
+                reached=bool(reached[n]),
+                filtered=None if behind_filter is None else tuple(filtered[:, n].tolist()),
+                trajectory=np.array(paths[n]),
                 contacts=np.array(contacts[n]).reshape(-1, 2),
                 goal_pose=None if poses is None else tuple(poses[info['goal'][n]].tolist())))
             collisions[n], seconds[n], reward[n], reached[n] = 0, 0.0, 0.0, False
+            filtered[:, n] = 0
     return [episode for own in found for episode in own[:each]]
 
 
@@ -104,6 +112,10 @@ class PolicyActor:
         seed: of the sampled actions.
         threshold: probability of having arrived above which it declares.
         known: houses that it was trained in, for a network with layers for several scenes.
+
+    Attributes:
+        filtered: [2,N] bool: where the action filter acted on the last actions, and where it
+            changed them; None: the policy has no filter, or has not acted yet.
     """
 
     def __init__(self, env, network: Policy, decoding: str, seed: int,
@@ -111,6 +123,7 @@ class PolicyActor:
         self.env, self.threshold = env, threshold
         self.known = known if network.config.scenes > 1 else ()
         self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
+        self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
         scene = None
@@ -118,9 +131,12 @@ class PolicyActor:
             scene = scene_numbers([self.env.houses[house].seed for house in self.env.house_index],
                                   self.known)
         actions = self.policy.act(observation, self.env.goals, reset, scene)
-        if self.env.declare_action is None:
-            return actions
-        return np.where(self.policy.arrival > self.threshold, self.env.declare_action, actions)
+        declares = np.zeros(len(actions), bool)
+        if self.env.declare_action is not None:
+            declares = self.policy.arrival > self.threshold
+        if self.policy.filtered is not None:
+            self.filtered = np.stack(self.policy.filtered) & ~declares
+        return np.where(declares, self.env.declare_action, actions) if declares.any() else actions
 
     @property
     def knows_arrival(self) -> bool:
@@ -153,7 +169,8 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
         By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
         'declared': ...}; without an arrival head 'arrival' alone.
     """
-    robot, rows = robot or RobotSpec(), {}
+    robot = robot or RobotSpec()
+    rows: Rows = {}
     threshold = STOP_THRESHOLD if threshold is None else threshold
     each = -(-episodes // len(houses))
     for chunk, begin in enumerate(range(0, len(houses), HOUSES_AT_ONCE)):
@@ -167,7 +184,9 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
                 env.set_shown_goal(shown)
                 rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
                     env, actor, rounds * environments, seed=seed + chunk, robot=robot))
-            if env.config.task != 'image' or not next(iter(actors.values()))[0].knows_arrival:
+            own, _ = next(iter(actors.values()))
+            if env.config.task != 'image' or not (
+                    isinstance(own, PolicyActor) and own.knows_arrival):
                 break  # nothing to declare, or nobody to declare it
     return rows
 

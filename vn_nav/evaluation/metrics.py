@@ -37,6 +37,8 @@ class Episode:
     scene: int = 0  # seed of the house
     declared: bool | None = None  # whether the policy said "arrived"; None: nobody asked it to
     reached: bool = False  # was at the goal at the end of some decision, declared or not
+    # Decisions at which the policy's action filter acted, and changed the action; None: no filter.
+    filtered: tuple[int, int] | None = None
     # What a map shows; no figure depends on it.
     trajectory: np.ndarray | None = _hidden()  # [K,3] x, y [m], yaw [rad]: start and decisions
     contacts: np.ndarray | None = _hidden()  # [C,2] where the robot touched something [m]
@@ -56,9 +58,9 @@ def path_efficiency(episode: Episode) -> float:
 def bootstrap_interval(values: Sequence[float], *, samples: int = 2000, seed: int = 0
                        ) -> tuple[float, float]:
     """95 % interval of the mean by resampling episodes."""
-    values = np.asarray(values, float)
+    sample = np.asarray(values, float)
     rng = np.random.default_rng(seed)
-    means = values[rng.integers(len(values), size=(samples, len(values)))].mean(axis=1)
+    means = sample[rng.integers(len(sample), size=(samples, len(sample)))].mean(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)
 
@@ -68,7 +70,9 @@ def summarise(episodes: Sequence[Episode]) -> dict:
 
     Under declared stop there are three more: `declared` and `false_stops`, the shares of episodes
     that the policy ended, and that it ended in vain, and `reached`, the share in which the robot
-    stood at its goal at some time, whether it said so or not.
+    stood at its goal at some time, whether it said so or not. Behind an action filter there are
+    two: `filter_acted` and `filter_changed`, the shares of decisions at which it offset a logit,
+    and at which another action came out than without it.
 
     Raises:
         ValueError: no episodes, or episodes of both kinds.
@@ -102,4 +106,7 @@ def summarise(episodes: Sequence[Episode]) -> dict:
             'false_stops': float(np.mean([e.declared and not e.success for e in episodes])),
             'reached': float(np.mean([e.reached for e in episodes])),
         }
+    if all(e.filtered is not None for e in episodes):
+        figures |= {name: sum(e.filtered[k] for e in episodes) / max(decisions, 1)
+                    for k, name in enumerate(('filter_acted', 'filter_changed'))}
     return figures

@@ -98,13 +98,14 @@ class Drives:
     def pictures(self, name: str, rows: np.ndarray) -> np.ndarray:
         """`image`, `depth` or `labels` of some rows [K] (that have it), as in `DriveSet`."""
         number = np.searchsorted(self._first, rows, side='right') - 1
-        found = None
+        found: np.ndarray | None = None
         for k in np.unique(number):
             here = number == k
             part = getattr(self.sets[k], name)[rows[here] - self._first[k]]
             if found is None:
                 found = np.empty((len(rows), *part.shape[1:]), part.dtype)
             found[here] = part
+        assert found is not None  # there is a row
         return found
 
     def label(self, rows: np.ndarray, goals: np.ndarray) -> Labels:

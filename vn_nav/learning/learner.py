@@ -264,7 +264,10 @@ class Learner:
         config, valid = self.config, own_frames(batch)
         latents, _ = self.network.latents(_rows(batch.observation), batch.starts[:-1], batch.state)
         output = self.network.read(latents)
-        log_all = torch.log_softmax(output.logits, dim=-1)
+        logits = output.logits
+        if batch.filter_offsets is not None:  # the actions were chosen behind the action filter
+            logits = logits + batch.filter_offsets
+        log_all = torch.log_softmax(logits, dim=-1)
         log_new = log_all.gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
         log_ratio = log_new - batch.log_probability
         ratio = log_ratio.exp()
@@ -402,7 +405,8 @@ def select(rollout: Rollout, columns: Tensor, few_goals: bool = True) -> Rollout
                else RecurrentState(*(rows[columns] for rows in rollout.state))),
         privileged={key: part(rows) for key, rows in rollout.privileged.items()},
         driven=part(rollout.driven),
-        log_probability=part(rollout.log_probability), value=part(rollout.value))
+        log_probability=part(rollout.log_probability), value=part(rollout.value),
+        filter_offsets=part(rollout.filter_offsets))
 
 
 def _few_goals(observation: Observation) -> Observation:

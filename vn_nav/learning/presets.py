@@ -24,6 +24,7 @@ import typing
 
 from vn_nav.errors import UserError
 from vn_nav.learning.learner import LearnerConfig
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.encoders import LARGE
 from vn_nav.policy.network import NetworkConfig
 
@@ -62,6 +63,9 @@ class TrainConfig(LearnerConfig):
     pose_to_memory: bool = False
     places: int = 0  # spots of a place that `vn_nav teach` has taught
     track_goal: bool = False  # by dead reckoning, see `vn_nav.policy.memory.GoalTracker`
+    # Whether a policy that tracks its goal acts behind the filter of blocked actions, in rollouts
+    # and wherever its checkpoint is used, see `vn_nav.policy.action_filter`.
+    action_filter: bool = True
     # Of icra2017: the file with the weights of ResNet-50 (without one: the small random encoder),
     # and the scenes with layers of their own (house i of the environment is scene i).
     frozen_weights: str = ''
@@ -148,7 +152,8 @@ class TrainConfig(LearnerConfig):
             blocks=self.blocks, features=self.features, hidden=self.hidden,
             frames=self.stacked_frames, heads=tuple(heads), deconvolutions=deconvolutions,
             pose_to_memory=self.pose_to_memory, places=self.places,
-            moves=moves if self.track_goal else (), pixel_mean=self.pixel_mean,
+            moves=moves if self.track_goal else (),
+            action_filter='' if self.action_filter else NONE, pixel_mean=self.pixel_mean,
             pixel_std=self.pixel_std, frozen='resnet50' if self.frozen_weights else '',
             scenes=self.scenes)
 

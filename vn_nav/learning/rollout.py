@@ -18,9 +18,10 @@ from torch import Tensor
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
+from vn_nav.policy.action_filter import make_filter
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
-from vn_nav.policy.zhu import check_scenes
+from vn_nav.policy.zhu import Siamese, check_scenes
 
 
 @dataclasses.dataclass
@@ -41,6 +42,8 @@ class Rollout:
     # When it was chosen and seen; None where nobody wrote it down (replay, bags).
     log_probability: Tensor | None = None  # [T,B] of the action
     value: Tensor | None = None  # [T+1,B]
+    # [T,B,A] float32, what the action filter added to the logits; None: there was none.
+    filter_offsets: Tensor | None = None
 
     @property
     def frames(self) -> int:
@@ -103,6 +106,8 @@ class Collector:
         self.starts = torch.ones(n, dtype=torch.bool, device=self.device)
         self.driven = torch.zeros_like(self.starts)  # by a teacher, in this episode
         self.state = network.initial_state(n)
+        config = network.config
+        self._filter = make_filter(config.filter_name, config.moves, n, self.device)
         # Of each environment's present episode: its number, return, decisions and collisions.
         self._totals = tuple(torch.zeros(n, dtype=dtype, device=self.device) for dtype in (
             torch.int64, torch.float64, torch.int64, torch.int64))
@@ -146,11 +151,13 @@ class Collector:
                            empty(steps + 1, real), self._empty_extras(steps + 1))
         told = {key: empty(steps + 1, rows.dtype, *rows.shape[1:])
                 for key, rows in self.told.items()}
+        driven = None if teacher is None else empty(steps, flag)
+        chosen, value = empty(steps, real), empty(steps + 1, real)
         rollout = Rollout(
             seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
             empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, told,
-            None if teacher is None else empty(steps, flag), empty(steps, real),
-            empty(steps + 1, real))
+            driven, chosen, value, None if self._filter is None else empty(
+                steps, real, len(self.network.config.actions)))
         facts = empty(steps, torch.float64, 1 + len(self._totals))
         goal_maps = self._goal_maps()
         for t in range(steps + 1):
@@ -170,20 +177,25 @@ class Collector:
                               seen.last_reward[now], extras)
             output, state = self.network(row, rollout.starts[now], self.state,
                                          goal_maps(seen.goal_index[t]))
-            rollout.value[t] = output.value[0]
+            value[t] = output.value[0]
             if t == steps:
                 break  # this observation only bootstraps; the next rollout begins with it
             self.state = state
-            log_probability = torch.log_softmax(output.logits[0], dim=-1)
+            logits = output.logits[0]
+            if self._filter is not None:
+                rollout.filter_offsets[t] = self._filter.offsets(
+                    image[t], seen.last_action[t], rollout.starts[t])
+                logits = logits + rollout.filter_offsets[t]
+            log_probability = torch.log_softmax(logits, dim=-1)
             action = self._sample(log_probability)
-            if teacher is not None:
-                rollout.driven[t] = self.driven
+            if teacher is not None and driven is not None:
+                driven[t] = self.driven
                 action = torch.where(self.driven[:, None], told[teacher][t][:, None], action)
             rollout.action[t] = action[:, 0]
-            rollout.log_probability[t] = log_probability.gather(1, action)[:, 0]
+            chosen[t] = log_probability.gather(1, action)[:, 0]
             facts[t] = self._step(rollout, t)
         ended = rollout.terminated | rollout.truncated
-        return rollout, _episodes(ended if teacher is None else ended & ~rollout.driven, facts)
+        return rollout, _episodes(ended if driven is None else ended & ~driven, facts)
 
     def _tensor(self, rows) -> Tensor:
         """Rows of the environment, on the network's device; shared where they are there."""
@@ -209,8 +221,9 @@ class Collector:
         """Room for what only the architecture icra2017 looks at."""
         if not self.network.frozen:
             return None
-        n, features = self.env.num_envs, self.network.encoder.frozen.features
-        extras = {'features': torch.empty(steps, n, features, device=self.device)}
+        encoder, n = self.network.encoder, self.env.num_envs
+        assert isinstance(encoder, Siamese)  # which is frozen
+        extras = {'features': torch.empty(steps, n, encoder.frozen.features, device=self.device)}
         if self._scenes > 1:
             extras['scene'] = torch.empty(steps, n, dtype=torch.int64, device=self.device)
         return extras
@@ -271,6 +284,8 @@ class Collector:
             'starts': copy(self.starts), 'driven': copy(self.driven),
             'memory': [copy(part) for part in self.state],
             'totals': [copy(total) for total in self._totals],
+            'filter': None if self._filter is None else {
+                name: copy(rows) for name, rows in self._filter.state_dict().items()},
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -283,6 +298,9 @@ class Collector:
         self.state = RecurrentState(*map(self._tensor, state['memory']))
         for total, saved in zip(self._totals, state['totals'], strict=True):
             total.copy_(saved)
+        # A training of before there was a filter in it goes on with an empty one.
+        if self._filter is not None and state.get('filter') is not None:
+            self._filter.load_state_dict(state['filter'])
 
 
 def _on_host(rows):

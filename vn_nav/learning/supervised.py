@@ -131,10 +131,12 @@ class Objective:
 
     def losses(self, batch: Batch, tally: Tally) -> dict[str, Tensor]:
         """Losses by part; counted in the tally."""
-        losses, poses = {}, []
-        if batch.rows is not None:
+        losses: dict[str, Tensor] = {}
+        poses: list[tuple[Pose, np.ndarray, np.ndarray]] = []
+        if batch.rows is not None and batch.goals is not None:
             latents = self._look_once(batch.rows, batch.goals)
-            poses.append((latents.pose, batch.rows, batch.goals))
+            if latents.pose is not None:
+                poses.append((latents.pose, batch.rows, batch.goals))
             for name in self.parts:
                 if name in IMAGE_HEADS:
                     losses[name] = self._image_loss(name, latents.maps, batch, tally)
@@ -185,12 +187,14 @@ class Objective:
         """
         network, key = self.network, NEEDS.get(name, 'image')
         rows = batch.goals if name == 'goal_segmentation' else batch.rows
+        assert rows is not None  # pictures are drawn of pairs
         known = np.ones(len(rows), bool) if key == 'image' else self.drives.has[key][rows]
         count = int(known.sum())
         if not count:
             return torch.zeros((), device=network.device)
         shown = self._tensor(self.drives.pictures(key, rows[known]))
-        target, weight = image_target(network, name, shown), 1.0
+        target = image_target(network, name, shown)
+        weight: Tensor | float = 1.0
         if name == 'depth':
             weight = average_pool_target((shown > 0).float().unsqueeze(1), network.target_side,
                                          network.cell)

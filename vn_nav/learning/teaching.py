@@ -1,7 +1,7 @@
 """What `vn_nav teach` does with a place: divides its minutes, learns, measures, keeps.
 
 The simulator's half, which makes a place out of pictures with poses, comes from the caller
-(`vn_sim_bridge.teach_place`).
+(`vn_sim_bridge.teach_place_place`).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import numpy as np
 import torch
 
 from vn_nav.cli.evaluate import DRIVE_SPLITS
+from vn_nav.cli.teach_evaluation import LEAST, Evaluation, Plan, cost_of, plan, rows_of
 from vn_nav.evaluation import evaluator
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BANK, BATCH, Views, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
-from vn_nav.learning.teach_evaluation import LEAST, Evaluation, Plan, cost_of, plan, rows_of
 from vn_nav.learning.trainer import CHECKPOINT, STATE, has_fast_bfloat16, train
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
@@ -52,7 +52,7 @@ COLLISION_REWARD = -0.05  # of leaving what the pictures cover
 
 
 class Place(Protocol):
-    """What the simulator's half makes of a drive; `vn_sim_bridge.teach_place` is one."""
+    """What the simulator's half makes of a drive; `vn_sim_bridge.teach_place_place` is one."""
 
     def build_graph(self, pictures, poses, episode, robot: RobotSpec, **options) -> Any:
         """A place out of pictures with poses."""

@@ -426,6 +426,8 @@ class Training:
     def _identity(self) -> dict:
         """What must not change between save and resumption."""
         network = dataclasses.asdict(self.network.config)
+        if self.config.action_filter:  # trainings of before there was a choice know no such key
+            del network['action_filter']
         return {
             'bags': None if self.bags is None else self.bags.identity,
             'action names': list(network.pop('actions')),

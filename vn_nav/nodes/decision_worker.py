@@ -16,6 +16,7 @@ from vn_msgs_py import images
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.window import Window
 from vn_nav.observation import crop_fraction, needed_side, preprocess
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
@@ -107,6 +108,14 @@ class DecisionWorker:
                 self._goal = self._goal_in_force
                 self._wake.notify_all()
 
+    def filter_values(self) -> dict[str, str | int]:
+        """What diagnostics say of the action filter: its name, and its counts until now."""
+        counts = self._runtime.filter_counts
+        return {'action_filter': self._runtime.action_filter} | (
+            {} if self._runtime.action_filter == NONE else {
+                'filter_decisions': counts.decisions, 'filter_acted': counts.acted,
+                'filter_changed': counts.changed})
+
     def check_fov(self) -> None:
         """Raise UserError where the camera sees less than the policy needs."""
         if self.camera_fov is not None:
@@ -172,13 +181,14 @@ class DecisionWorker:
             if self._epoch != self._navigator.epoch:
                 self._epoch = self._navigator.epoch
                 self._runtime.reset()
-            if self._shadow and (self._told is None or stamp < self._told[0]):
+            told = self._told if self._shadow else None
+            if self._shadow and (told is None or stamp < told[0]):
                 return
             ticket = self._navigator.request(stamp, now)
             if ticket is None:
                 return
-            if self._shadow:
-                self._runtime.correct(self._told[1])
+            if told is not None:
+                self._runtime.correct(told[1])
                 self._told = None
         try:
             action = self._runtime.act(picture)

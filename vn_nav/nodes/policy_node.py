@@ -338,7 +338,8 @@ class PolicyNode(LifecycleNode):
             if state is State.IDLE and not self.is_running:
                 reason = 'the node is not active'
             fov, gate = self._worker.camera_fov, self.navigator.gate
-            values = {'decisions': self.navigator.decisions, **self._inputs.values(),
+            values = {'decisions': self.navigator.decisions, **self._worker.filter_values(),
+                      **self._inputs.values(),
                       'camera_fov_deg': round(math.degrees(fov), 1) if fov else 'unknown',
                       **{f'dropped: {kind}': n for kind, n in gate.dropped.items()},
                       **({'last_dropped': gate.last} if gate.last else {}),

@@ -53,6 +53,7 @@ DOMAINS = range(215, 233)  # beyond those that people choose; they leave Linux's
 ALONE = 3.0  # s in which others on a domain are heard of, also on a busy machine
 LOOK = 0.25  # s between looks at who is there
 PATIENCE = 120.0  # s for an answer: a busy machine starts the node slowly
+LAST_WORDS = 5.0  # s for diagnostics after the last decision
 AGAIN = 0.3  # s without a picture, or an answer to it, after which it is shown again
 ARMING = 10_000_000_000, 1_000_000  # ns before the drive, and between the pictures there
 # What the policy publishes, by the names that the node gives it.
@@ -287,9 +288,18 @@ class _Stage:
                     self._take(event)
                 if self._picture and time.monotonic() - self._shown_at > AGAIN:
                     self._show(self._picture, 0)  # the node's watchdog looks at the wall clock
+            self._hear_the_last_counts()
         except _Interrupted:
             return False
         return True
+
+    def _hear_the_last_counts(self) -> None:
+        """Diagnostics come once a second: those after the last decision belong in the bag."""
+        end = time.monotonic() + LAST_WORDS
+        while (int(self._diagnosis.get('filter_decisions', len(self.latencies)))
+               < len(self.latencies) and time.monotonic() < end):
+            self._check()
+            self._domain.executor.spin_once(timeout_sec=0.05)
 
     def _take(self, event: Event) -> None:
         self._log_time = max(self._log_time, event.log_time)

@@ -21,6 +21,7 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.files import sync_folder, write_file
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint_info import (
     CARD,
     CHECKSUM,
@@ -79,6 +80,7 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
         **info,
     }
     del config['network']['actions']  # said once, under action_names
+    config['network']['action_filter'] = network.config.filter_name
     try:
         # As it will be read: JSON has no tuples, and only text as keys.
         config = json.loads(json.dumps(config, allow_nan=False))
@@ -228,6 +230,9 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
             config['decoding']],
         'Network': f'{_describe(network)}; {parameters:,} parameters, {size / 1e6:.1f} MB',
+        **({'Action filter': 'blocked actions: what led nowhere is not done again from there; '
+            'part of every figure (docs/method.md)'}
+           if network.get('action_filter', NONE) != NONE else {}),
         'Trained in': config['data'] or home,
         **({'Losses': ', '.join(config['losses']).replace('_', ' ')} if config['losses'] else {}),
         'Training': ('no episode was driven; ' if config['data'] and not config['frames'] else

@@ -21,13 +21,17 @@ that its network uses:
 | `arrival` | float32 [1] | logit: the robot stands where the goal was taken |
 | `next_hidden`, `next_cell` | | the memory, to pass next time |
 
-What is kept in mind of the spot (`vn_nav.policy.spot`) is not in the files: with a policy that
-knows its moves add it to the logits.
+The action filter of a checkpoint is no part of the network, and not in `policy.onnx`. Where the
+metadata name one (`action_filter`), the figures of the checkpoint were measured behind it: add
+what `vn_nav.policy.action_filter.BlockedActionFilter` says, which needs NumPy alone, to the
+logits, once for each decision (an example is in the exported `README.md`).
 
 The metadata of both files are strings: `action_names` (JSON, in the order of the logits), `size`
 (S), `camera_fov_deg`, `camera_height` [m], `decoding` (sample or greedy), `stop_threshold`
-(probability of arrival; empty: none), `world_version`, `task`, `sha256` of the checkpoint's
-weights, `opset`, and `inputs` and `outputs` (JSON: name to type and shape).
+(probability of arrival; empty: none), `action_filter` (none or blocked_actions), `moves` (JSON:
+dx, dy [m], dyaw [rad] of each action, if the policy knows them), `world_version`,
+`task`, `sha256` of the checkpoint's weights, `opset`, and `inputs` and `outputs` (JSON: name to
+type and shape).
 """
 
 from __future__ import annotations
@@ -43,11 +47,12 @@ from torch import Tensor, nn
 from vn_nav.errors import UserError
 from vn_nav.files import write_file
 from vn_nav.observation import Observation
+from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
 
-POLICY, GOAL = 'policy.onnx', 'goal.onnx'
+POLICY, GOAL, README = 'policy.onnx', 'goal.onnx', 'README.md'
 OPSET = 17
 
 
@@ -59,13 +64,15 @@ def export_onnx(checkpoint: LoadedCheckpoint, folder: str | Path) -> list[Path]:
         folder: where; made if need be. Files of an earlier export are replaced.
 
     Returns:
-        The files: `policy.onnx`, and `goal.onnx` if the policy looks at goals.
+        The models: `policy.onnx`, and `goal.onnx` if the policy looks at goals. `README.md` beside
+        them says how they are used.
 
     Raises:
         UserError: the package onnx is not installed, or the folder cannot be written.
     """
     step, folder = _Step(checkpoint.network), Path(folder)
-    models = {POLICY: (step, step.example, step.output_names)}
+    models: dict[str, tuple[nn.Module, dict[str, Tensor], list[str]]] = {
+        POLICY: (step, step.example, step.output_names)}
     if 'goal' in step.example:
         models[GOAL] = (_Goal(checkpoint.network), {'picture': step.example['image']}, ['goal'])
     files = {name: _export(*model, checkpoint) for name, model in models.items()}
@@ -74,6 +81,7 @@ def export_onnx(checkpoint: LoadedCheckpoint, folder: str | Path) -> list[Path]:
         (folder / GOAL).unlink(missing_ok=True)  # of another policy, which looked at goals
         for name, data in files.items():
             write_file(folder / name, data)
+        write_file(folder / README, _readme(step, checkpoint).encode())
     except OSError as error:
         raise UserError('an export is written to a folder',
                         f'{error.filename or folder}: {error.strerror}',
@@ -149,7 +157,9 @@ def _export(module: nn.Module, example: dict[str, Tensor], outputs: list[str],
         # its newer exporter, which needs more packages.
         warnings.simplefilter('ignore', torch.jit.TracerWarning)
         warnings.simplefilter('ignore', DeprecationWarning)
-        torch.onnx.export(module.eval(), tuple(example.values()), buffer, dynamo=False,
+        # torch's annotations know only the new exporter, which takes no open file.
+        torch.onnx.export(module.eval(), tuple(example.values()),
+                          buffer, dynamo=False,  # type: ignore[arg-type]
                           opset_version=OPSET, input_names=list(example), output_names=outputs)
     model = onnx.load_from_string(buffer.getvalue())
     info, config = checkpoint.info, checkpoint.config
@@ -157,6 +167,7 @@ def _export(module: nn.Module, example: dict[str, Tensor], outputs: list[str],
         'action_names': json.dumps(config.actions), 'size': config.size, 'opset': OPSET,
         **{name: info[name] for name in ('camera_fov_deg', 'camera_height', 'decoding',
                                          'world_version', 'task', 'sha256')},
+        'action_filter': config.filter_name, 'moves': json.dumps(config.moves),
         'stop_threshold': '' if info['stop_threshold'] is None else info['stop_threshold'],
         'inputs': _signature(model.graph.input), 'outputs': _signature(model.graph.output),
     }
@@ -171,3 +182,45 @@ def _signature(values) -> str:
     return json.dumps({value.name: [
         onnx.TensorProto.DataType.Name(value.type.tensor_type.elem_type).lower(),
         [part.dim_value for part in value.type.tensor_type.shape.dim]] for value in values})
+
+
+def _readme(step: _Step, checkpoint: LoadedCheckpoint) -> str:
+    """What the folder holds, and a decision in Python that runs as it stands."""
+    config, info = checkpoint.config, checkpoint.info
+    words = 'none. Actions are chosen by the logits as they are.'
+    code = ['import json', '', 'import numpy as np', 'import onnxruntime', '',
+            f"policy = onnxruntime.InferenceSession('{POLICY}')",
+            'facts = policy.get_modelmeta().custom_metadata_map',
+            "actions = json.loads(facts['action_names'])",
+            "types = {'tensor(float)': 'f4', 'tensor(uint8)': 'u1', 'tensor(int64)': 'i8', "
+            "'tensor(bool)': '?'}",
+            'inputs = {part.name: np.zeros(part.shape, types[part.type])',
+            '          for part in policy.get_inputs()}']
+    if 'goal' in step.example:
+        code += [f"goal = onnxruntime.InferenceSession('{GOAL}')",
+                 "inputs['goal'], = goal.run(None, {'picture': goal_picture})  # uint8 [1,3,S,S]"]
+    logits = "said['logits']"
+    if config.filter_name != NONE:
+        words = (f'`{config.filter_name}`. It is no part of the network; the figures of the '
+                 'checkpoint were measured behind it.\nAdd its offsets to the logits, once for '
+                 'each decision, as below.')
+        code.insert(4, 'from vn_nav.policy.action_filter import BlockedActionFilter  # NumPy')
+        code += ["blocked = BlockedActionFilter(json.loads(facts['moves']), 1)"]
+        logits += " + blocked.offsets(image, given['last_action'], given['start'])"
+    code += ['', '', 'def decide(image, last_action):',
+             '    """Logits [1,A] for a picture, uint8 [1,3,S,S]; last_action: -1 at a start."""',
+             "    given = {'image': image, 'last_action': np.array([last_action]),",
+             "             'start': np.array([last_action < 0])}",
+             '    inputs.update({name: rows for name, rows in given.items() if name in inputs})',
+             '    names = [part.name for part in policy.get_outputs()]',
+             '    said = dict(zip(names, policy.run(None, inputs)))',
+             *(f"    inputs['{name}'] = said['next_{name}']" for name in step.memory),
+             f'    return {logits}']
+    return '\n'.join([
+        '# A visual navigation policy as ONNX', '',
+        f'Exported by vn_nav from weights with SHA-256 `{info["sha256"]}`.', 'The metadata of the '
+        'files say what pictures, actions, inputs and outputs are.', '',
+        f'Decoding: {info["decoding"]}. Action filter: {words}', '',
+        '```python', *code, '```', '',
+        'An episode begins, with `last_action` -1, at a new goal and where the robot was moved.',
+        ''])

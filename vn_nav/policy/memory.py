@@ -126,6 +126,9 @@ class GoalTracker(nn.Module):
     FADE = 0.95  # of the weight, each action
     MOST = 100.0  # the weight of an estimate
 
+    shift: Tensor  # [A+1,2] m
+    turn: Tensor  # [A+1,2] cos and sin
+
     def __init__(self, moves: tuple[tuple[float, float, float], ...]):
         super().__init__()
         table = torch.tensor([*moves, (0.0, 0.0, 0.0)])  # the last row: no action yet

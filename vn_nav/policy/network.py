@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
+from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
 from vn_nav.policy.encoders import Fused, Matching, OneStream, TwoStreams
 from vn_nav.policy.heads import (
     GoalPose,
@@ -31,7 +32,7 @@ from vn_nav.policy.memory import (
     RecurrentState,
     stack_frames,
 )
-from vn_nav.policy.places import WIDTH, LookAround, PlaceRecogniser, Routes
+from vn_nav.policy.places import WIDTH, MultiViewAveraging, PlaceClassifier, Routes
 from vn_nav.policy.zhu import FROZEN, SceneLinear, Siamese
 
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
@@ -63,9 +64,13 @@ class NetworkConfig:
     # [A,3] dx, dy [m], dyaw [rad] of the actions: with them the memory also sees where the goal
     # stands by dead reckoning since it was seen, see `GoalTracker`. Empty: it does not.
     moves: tuple[tuple[float, float, float], ...] = ()
-    # Spots of one place that the policy knows by heart; more than none: the memory also sees where
-    # there picture and goal were taken, see `vn_nav.policy.places`.
+    # Place cells of the one place that the policy recognises; more than none: the memory also sees
+    # where there picture and goal were taken, see `vn_nav.policy.places`.
     places: int = 0
+    # Of `vn_nav.policy.action_filter.FILTERS`: what whoever chooses actions by the logits puts in
+    # between, no part of the network. '': blocked actions where there are moves, as it was before
+    # checkpoints said so; else none.
+    action_filter: str = ''
     # Grey levels. Standardised input is what made learning work; whole numbers up to 256 less a
     # whole mean stay exact in bfloat16.
     pixel_mean: float = 120.0
@@ -78,6 +83,8 @@ class NetworkConfig:
         for name in ('actions', 'channels', 'heads'):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         object.__setattr__(self, 'moves', tuple(map(tuple, self.moves)))
+        if self.action_filter == self._usual_filter:  # said or not, it is the same
+            object.__setattr__(self, 'action_filter', '')
         rules = (
             (len(self.actions) >= 2 and len(set(self.actions)) == len(self.actions),
              'a policy has at least two actions with distinct names', self.actions),
@@ -102,9 +109,13 @@ class NetworkConfig:
             (not self.moves or (len(self.moves) == len(self.actions)
                                 and all(len(move) == 3 for move in self.moves)),
              'there is a move (dx, dy, dyaw) for each action', self.moves),
+            (self.filter_name in FILTERS, f'the action filter is one of {", ".join(FILTERS)}',
+             self.action_filter),
+            (self.filter_name == NONE or self.moves,
+             'an action filter is told what the actions do: it needs moves', self.action_filter),
             (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
                                   and self.architecture != 'icra2017'),
-             'a policy with an LSTM knows none, or 2 to 1024 spots of a place', self.places),
+             'a policy with an LSTM has no place cells, or 2 to 1024', self.places),
             (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
             (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
              'one', self.frozen),
@@ -118,6 +129,15 @@ class NetworkConfig:
         for kept, rule, received in rules:
             if not kept:
                 raise UserError(rule, received, 'correct the network configuration')
+
+    @property
+    def filter_name(self) -> str:
+        """The action filter, by its name in `vn_nav.policy.action_filter.FILTERS`."""
+        return self.action_filter or self._usual_filter
+
+    @property
+    def _usual_filter(self) -> str:
+        return BLOCKED_ACTIONS if self.moves else NONE
 
 
 class PolicyOutput(NamedTuple):
@@ -178,8 +198,8 @@ class Policy(nn.Module):
         self.places = self.routes = self.around = None
         if config.places:
             if config.moves:
-                self.around = LookAround(config.moves, config.places)
-            self.places = PlaceRecogniser(config.size, config.places, config.pixel_mean,
+                self.around = MultiViewAveraging(config.moves, config.places)
+            self.places = PlaceClassifier(config.size, config.places, config.pixel_mean,
                                           config.pixel_std)
             self.routes = Routes(self.places.width, len(config.actions))
             with torch.no_grad():
@@ -244,7 +264,7 @@ class Policy(nn.Module):
 
     @property
     def _beside(self) -> tuple[int, int]:
-        """Numbers that are remembered beside the memory's own, by tracker and look around."""
+        """Numbers that are remembered beside the memory's: by tracker, by multi-view averaging."""
         return (0 if self.tracker is None else GoalTracker.WIDTH,
                 0 if self.around is None else self.around.width)
 

@@ -1,10 +1,10 @@
-"""Where in one known place a picture was taken: what a taught policy knows by heart.
+"""Place recognition: where in the one place that it was taught a policy sees itself.
 
 A policy for any house compares picture and goal, and looks for the goal where it sees nothing of
-it. In a place that it was shown it can know where the goal stands instead. The recogniser answers
+it. In a place that it was shown it can know where the goal stands instead. The classifier answers
 as the place cells and head-direction cells of Banino et al. 2018 (Nature 557): probabilities over
-spots of the floor and over headings, which can say "here or there" where a pose (Kendall et al.
-2015, PoseNet) would have to lie in between.
+place cells on the floor and over headings, which can say "here or there" where a pose (Kendall et
+al. 2015, PoseNet) would have to lie in between.
 """
 
 from __future__ import annotations
@@ -22,20 +22,23 @@ HEADINGS = 16  # directions that are told apart
 WIDTH = 128  # of what the memory is told
 
 
-class PlaceRecogniser(nn.Module):
-    """Spot and heading of a picture, as probabilities.
+class PlaceClassifier(nn.Module):
+    """Place cell and heading of a picture, as probabilities.
 
     The layers by which `Matching` compares pictures, which know one thing in many lights and from
     many sides, then a convolution 3x3 and two linear layers. It is fitted before the policy learns
     (`vn_nav.learning.places`) and stays as it is: no gradient passes it.
 
     Args:
-        size: side of the pictures [pixels]; spots: how many there are, K.
+        size: side of the pictures [pixels]; spots: number of place cells, K.
         mean, std: grey levels.
 
     Attributes:
-        spots: [K,2] m, where they lie in the frame of the place.
+        spots: [K,2] m, where the place cells lie in the frame of the place; called so in
+            the weights of checkpoints.
     """
+
+    spots: Tensor
 
     def __init__(self, size: int, spots: int, mean: float, std: float):
         super().__init__()
@@ -63,7 +66,7 @@ class PlaceRecogniser(nn.Module):
         return self.third, self.trunk, self.out
 
     def scores(self, pictures: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Log-probabilities of spots [N,K] and headings [N,16] of pictures [N,3,S,S]; float32."""
+        """Log-probabilities of place cells [N,K] and headings [N,16], float32; of [N,3,S,S]."""
         x = F.relu(apply(self.second, F.relu(self.first(pictures, dtype))))
         x = Matching.SCALE * directions(apply(self.key, x))
         x = F.relu(apply(self.third, x))
@@ -85,20 +88,22 @@ class PlaceRecogniser(nn.Module):
         return torch.cat([position, torch.atan2(y, x).unsqueeze(1)], dim=1)
 
 
-class LookAround(nn.Module):
-    """On which spot a robot stands that turns there: the mean of what its pictures say.
+class MultiViewAveraging(nn.Module):
+    """Multi-view averaging: while a robot turns, the mean of what its pictures say of its place.
 
     One direction often looks like two places, and of a robot that hears another one with every
     turn the advice turns it to and fro. Probabilities are averaged (a mixture), not multiplied:
-    pictures of one spot are anything but independent.
+    pictures of one place are anything but independent.
 
     Args:
         moves: [A,3] dx, dy [m], dyaw [rad] of the actions.
-        spots: how many there are, K.
+        spots: number of place cells, K.
 
     Attributes:
         width: K + 1 numbers to remember: the sum of the probabilities, and of how many pictures.
     """
+
+    stays: Tensor
 
     def __init__(self, moves: Sequence[Sequence[float]], spots: int):
         super().__init__()
@@ -118,8 +123,8 @@ class LookAround(nn.Module):
             before: [B,K+1] remembered from before the first row.
 
         Returns:
-            [T,B,K+16], spots averaged and headings as they are, and what is remembered after the
-            last row.
+            [T,B,K+16], place cells averaged and headings as they are, and what is remembered
+            after the last row.
         """
         keep = (self.stays[last_action] & ~starts.unsqueeze(2)).to(before.dtype)
         spots = here[..., :self.width - 1].to(before.dtype)

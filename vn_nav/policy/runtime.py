@@ -10,11 +10,11 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
+from vn_nav.policy.action_filter import FilterCounts, make_filter
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
-from vn_nav.policy.spot import SpotMemory
 from vn_nav.policy.zhu import check_scenes
 
 
@@ -31,6 +31,33 @@ def choose(logits: torch.Tensor, decoding: str, generator: torch.Generator) -> t
     return torch.multinomial(torch.softmax(logits, -1), 1, generator=generator).squeeze(-1)
 
 
+def choose_filtered(logits: torch.Tensor, offsets: np.ndarray | None, decoding: str,
+                    generator: torch.Generator
+                    ) -> tuple[torch.Tensor, torch.Tensor, np.ndarray, np.ndarray]:
+    """Actions [N] under an action filter, and what it did.
+
+    Args:
+        logits: [N,A], of the policy.
+        offsets: [N,A] of the filter; None: there is none.
+        decoding, generator: see `choose`; the filter draws no random numbers.
+
+    Returns:
+        Actions [N], the logits that they were chosen by, and two [N] bool: where the filter acted,
+        and where another action came out than would have without it, by the same random numbers.
+
+    Raises:
+        FloatingPointError: a logit is not finite.
+    """
+    acted = np.zeros(len(logits), bool) if offsets is None else (offsets != 0).any(1)
+    if not acted.any():
+        return choose(logits, decoding, generator), logits, acted, acted
+    again = torch.Generator()
+    again.set_state(generator.get_state())
+    filtered = logits + torch.from_numpy(offsets)
+    actions = choose(filtered, decoding, generator)
+    return actions, filtered, acted, (actions != choose(logits, decoding, again)).numpy()
+
+
 class PolicyRuntime:
     """One robot's policy. Limits torch to one thread: more only add latency at this size.
 
@@ -45,6 +72,8 @@ class PolicyRuntime:
         size: side of the square pictures [pixels].
         action_names: an action's number is its place here.
         moves: what the actions do to the robot, if the policy counts on it; else empty.
+        action_filter: of `vn_nav.policy.action_filter.FILTERS`, as the checkpoint says.
+        filter_counts: how often it acted, since this object was made.
         camera_fov: field of view that the pictures have [rad].
         info: what else the checkpoint says.
         stop_threshold: the one in force; None: the policy declares nothing.
@@ -75,7 +104,9 @@ class PolicyRuntime:
         self._generator = torch.Generator().manual_seed(seed)
         self._goal_maps: torch.Tensor | None = None
         self._reward = torch.zeros(1, 1)  # a robot gets none
-        self._spot = SpotMemory(self.moves, 1) if self.moves else None
+        self.action_filter: str = checkpoint.config.filter_name
+        self.filter_counts = FilterCounts()
+        self._filter = make_filter(self.action_filter, self.moves, 1)
         self.reset()
 
     @torch.inference_mode()
@@ -122,16 +153,20 @@ class PolicyRuntime:
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
-        logits = output.logits[0]
-        if self._spot is not None:
-            logits = logits + self._spot.advise(picture, last, starts[0])
-        action = int(choose(logits, self.decoding, self._generator))
+        offsets = None
+        if self._filter is not None:
+            offsets = self._filter.offsets(image[None], last.numpy(), starts[0].numpy())
+        actions, _, acted, changed = choose_filtered(output.logits[0], offsets, self.decoding,
+                                                     self._generator)
+        action = int(actions)
         if output.arrival is not None:
             arrival = float(torch.sigmoid(output.arrival[0, 0]))
             if not math.isfinite(arrival):
                 raise FloatingPointError('the arrival of the policy is not finite')
             self.arrival = arrival
         self._state, self._last_action = state, action
+        if self._filter is not None:  # where the policy declares its stop nothing is driven
+            self.filter_counts.add(acted[0] and not self.arrived, changed[0] and not self.arrived)
         if self.arrived:
             self.reset()
         return action
@@ -157,8 +192,10 @@ class BatchedPolicy:
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
             the observation that `act` saw last; nan where the network has no such head.
-        logits: [N,A] tensor, of the actions at that observation, with what is in mind of the spot;
-            None before the first.
+        logits: [N,A] tensor, of the actions at that observation, behind the action filter; None
+            before the first.
+        filtered: two [N] bool: where the action filter acted at that observation, and where it
+            changed the action; None where the policy has none.
     """
 
     def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0):
@@ -170,8 +207,9 @@ class BatchedPolicy:
         self._state: RecurrentState = network.initial_state(num_envs)
         self._goals: np.ndarray | None = None
         self._goal_maps = GoalMaps(network)
-        moves = network.config.moves
-        self._spot = SpotMemory(moves, num_envs) if moves else None
+        config = network.config
+        self._filter = make_filter(config.filter_name, config.moves, num_envs)
+        self.filtered: tuple[np.ndarray, np.ndarray] | None = None
 
     @torch.inference_mode()
     def act(self, obs: dict[str, np.ndarray], goals: np.ndarray, reset_mask: np.ndarray,
@@ -196,19 +234,23 @@ class BatchedPolicy:
             self._goals, self._goal_maps = goals, GoalMaps(self.network)
         maps = self._goal_maps.of(torch.from_numpy(goals),
                                   torch.from_numpy(np.asarray(obs['goal_index'])))
+        last_action, reset_mask = np.asarray(obs['last_action']), np.asarray(reset_mask, bool)
         observation = Observation(
             torch.from_numpy(obs['image'])[None], None, None,
-            *(torch.from_numpy(np.asarray(obs[name]))[None]
-              for name in ('last_action', 'last_reward')), extras)
-        starts = torch.from_numpy(np.asarray(reset_mask, bool))[None]
+            *(torch.from_numpy(rows)[None]
+              for rows in (last_action, np.asarray(obs['last_reward']))), extras)
+        starts = torch.from_numpy(reset_mask)[None]
         output, self._state = self.network(observation, starts, self._state, maps)
         if output.arrival is not None:
             self.arrival = torch.sigmoid(output.arrival[0]).numpy()
-        self.logits = output.logits[0]
-        if self._spot is not None:
-            self.logits = self.logits + self._spot.advise(
-                observation.image[0], observation.last_action[0], starts[0])
-        return choose(self.logits, self.decoding, self._generator).numpy()
+        offsets = None
+        if self._filter is not None:
+            offsets = self._filter.offsets(obs['image'], last_action, reset_mask)
+        actions, self.logits, *filtered = choose_filtered(
+            output.logits[0], offsets, self.decoding, self._generator)
+        if self._filter is not None:
+            self.filtered = tuple(filtered)
+        return actions.numpy()
 
 
 def _check_decoding(decoding: str) -> None:

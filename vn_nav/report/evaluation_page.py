@@ -26,6 +26,9 @@ shortest way.</dd>
 undiscounted reward.</dd>
 <dt>Collisions, contact-free</dt><dd>Share of decisions that touched something; share of episodes
 that succeeded without any.</dd>
+<dt>Filter acted, filter changed</dt><dd>Share of decisions at which the policy's action filter
+offset an action (what led nowhere from there is blocked, and after much turning driving on is
+pushed); share at which another action came out than without it.</dd>
 <dt>Stop error</dt><dd>Distance and angle to the goal at the end of all episodes.</dd>
 <dt>Wrong goal, blank goal</dt><dd>The same policy on the same starts, but shown the picture of
 another place in the house, or plain grey; it is still measured at the right place. A policy that
@@ -131,6 +134,7 @@ def outcome(episode: Episode) -> str:
 
 
 def _map(episode: Episode, plan: dict, limit: int, bag: str | None) -> str:
+    assert episode.trajectory is not None  # of an episode that was driven here
     kind = 'yes' if episode.success else 'no'
     goals = [] if episode.goal_pose is None else [episode.goal_pose]
     drawn = floor_map(plan, [Journey(episode.trajectory, episode.success, episode.contacts)],

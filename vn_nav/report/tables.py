@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from vn_nav.evaluation.evaluator import DECLARED
 from vn_nav.report.page import table
@@ -36,6 +36,12 @@ STOP_COLUMNS: tuple[Column, ...] = (
 )
 
 
+FILTER_COLUMNS: tuple[Column, ...] = (  # where a row has an action filter
+    ('filter acted', lambda r: f'{r["filter_acted"]:.1%}' if 'filter_acted' in r else '-'),
+    ('filter changed', lambda r: f'{r["filter_changed"]:.1%}' if 'filter_changed' in r else '-'),
+)
+
+
 def place(split: str, houses: Sequence[int], bag: str | None = None) -> str:
     """A split and its houses, or the recorded drive, in a few words."""
     if bag is not None:
@@ -45,19 +51,20 @@ def place(split: str, houses: Sequence[int], bag: str | None = None) -> str:
     return f'{SPLITS[split].lower()} ({len(houses)} houses)'
 
 
-def _columns(stop: str) -> tuple[Column, ...]:
-    return COLUMNS[:1] + STOP_COLUMNS + COLUMNS[1:] if stop == DECLARED else COLUMNS
+def _columns(stop: str, rows: Iterable[dict]) -> tuple[Column, ...]:
+    columns = COLUMNS[:1] + STOP_COLUMNS + COLUMNS[1:] if stop == DECLARED else COLUMNS
+    return columns + (FILTER_COLUMNS if any('filter_acted' in row for row in rows) else ())
 
 
 def _rows_cells(rows: dict[str, dict], stop: str) -> tuple[list[str], list[list[str]]]:
-    columns = _columns(stop)
+    columns = _columns(stop, rows.values())
     return (['policy', *(heading for heading, _ in columns)],
             [[name, *(words(figures) for _, words in columns)] for name, figures in rows.items()])
 
 
 def _scenes_cells(scenes: dict, stop: str) -> tuple[list[str], list[list[str]]]:
     """A line a house: the policy's figures, and beside them the success of each control."""
-    columns = _columns(stop)
+    columns = _columns(stop, (row for rows in scenes.values() for row in rows[stop].values()))
     names = list(next(iter(scenes.values()))[stop])
     lines = []
     for seed, rows in scenes.items():
@@ -69,7 +76,7 @@ def _scenes_cells(scenes: dict, stop: str) -> tuple[list[str], list[list[str]]]:
 
 def row_line(name: str, figures: dict, stop: str) -> str:
     """A row in a line, as soon as it is measured."""
-    words = [f'{heading} {shown(figures)}' for heading, shown in _columns(stop)]
+    words = [f'{heading} {shown(figures)}' for heading, shown in _columns(stop, [figures])]
     return f'{name}: {figures["episodes"]} episodes, {", ".join(words)}'
 
 

@@ -177,7 +177,8 @@ class PairSampler:
             distance[k] = field.distance(poses[k:k + 1, :2])[0]
         return tasks.arrived(distance, error)
 
-    def _look(self, house, poses, numbers, view: int) -> tuple[Frames, tuple]:
+    def _look(self, house, poses, numbers, view: int | np.ndarray
+              ) -> tuple[Frames, tuple]:
         """Pictures from poses, and the cameras that took them; `view` tells the two apart."""
         appearance = self._backend.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
         frames = self._backend.view(house, poses, None, appearance,

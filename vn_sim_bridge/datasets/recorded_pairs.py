@@ -32,7 +32,8 @@ class GraphPairs:
         seed: of the draws.
     """
 
-    def __init__(self, graph: ImageGraph, robot: RobotSpec, goals: Sequence[int], seed: int = 0):
+    def __init__(self, graph: ImageGraph, robot: RobotSpec, goals: Sequence[int] | np.ndarray,
+                 seed: int = 0):
         if len(goals) < 1:
             raise UserError('pairs have goals', 'none', 'name some nodes')
         self.count = 0  # robots placed so far

@@ -15,6 +15,7 @@ import warp as wp
 
 from vn_nav.co_visibility import GRID, SLACK, TOLERANCE, lift
 from vn_nav.errors import UserError
+from vn_nav.reset_arguments import are_several, read_options, read_seed
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.floor.contacts import (
@@ -693,11 +694,12 @@ class WarpNavigationEnv:
         Raises:
             UserError: a list of seeds, or a `reset_mask`, which `NavigationEnv` knows.
         """
-        if 'reset_mask' in (options or {}) or not (seed is None or np.ndim(seed) == 0):
+        if 'reset_mask' in read_options(options, ('reset_mask',)) or are_several(seed):
             raise UserError('on a GPU all environments begin together, by one seed',
                             seed if options is None else options, 'use NavigationEnv')
+        seed = read_seed(seed)
         if seed is not None:
-            self._rules.seed = int(seed)
+            self._rules.seed = seed
             self._robots.episode.fill_(-1)
         wp.launch(restart, self.num_envs, [self._houses, self._robots, self._rules],
                   device=self.device)

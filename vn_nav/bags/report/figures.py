@@ -10,7 +10,7 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_rgb
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.doctor.figures import NOISE
+from vn_nav.bags.doctor.checks.figures import NOISE
 from vn_nav.bags.drive import Frame
 
 BINS = 240  # stretches of time, at most
@@ -211,7 +211,9 @@ class Ways:
 
     def _finish(self) -> None:
         """The end of an episode belongs to its way, however near to the point before."""
-        way = self._ways.get(self._last.episode) if self._last is not None else None
+        if self._last is None:
+            return
+        way = self._ways.get(self._last.episode)
         if way is not None and way[-1] is not self._last.pose:
             way.append(self._last.pose)
             self._points += 1

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from vn_nav import __version__
-from vn_nav.bags.doctor.figures import ERROR, Finding, TopicFigures
+from vn_nav.bags.doctor.checks.figures import ERROR, Finding, TopicFigures
 from vn_nav.bags.drive import COARSE, COMMAND_LASTS
 from vn_nav.bags.report.agreement import END, OTHER, STOP, Agreement, Disagreement, Judged
 from vn_nav.bags.report.figures import STRIP, Shot, Timeline
@@ -139,7 +139,7 @@ with the direction the robot faced.</figcaption></figure>"""
 
 
 def _grid(place, low: np.ndarray, high: np.ndarray, unit: float) -> list[Shape]:
-    lines = []
+    lines: list[Shape] = []
     for axis in (0, 1):
         for value in np.arange(math.ceil(low[axis] / unit), math.floor(high[axis] / unit) + 1):
             ends = np.array([low, high])

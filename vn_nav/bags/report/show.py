@@ -15,9 +15,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
-from vn_nav.bags.doctor.checks import diagnose
-from vn_nav.bags.doctor.figures import Diagnosis
-from vn_nav.bags.drive import Cutter, Frame, Heard, Report, find_topics, hear, synchronise
+from vn_nav.bags.doctor.checks.checks import diagnose
+from vn_nav.bags.doctor.checks.figures import Diagnosis
+from vn_nav.bags.drive import (
+    Cutter,
+    Frame,
+    Report,
+    TimestampedMessage,
+    find_topics,
+    hear,
+    synchronise,
+)
 from vn_nav.bags.report.agreement import Agreement, judge
 from vn_nav.bags.report.figures import Film, Goals, Odometer, Shot, Timeline, Ways
 from vn_nav.bags.roles import Topics
@@ -81,6 +89,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
     frames = synchronise(_heard(bag, names, velocities), names, report)
     for _ in Cutter(robot, report).cut(watched(frames)):
         pass
+    assert rates.origin is not None  # a camera was found: there are messages
     shown = Shown(diagnosis, rates.origin * 1e-9, names, rates, velocities, way.ways(),
                   film.shots(), goals, odometer, report, robot)
     if checkpoint is not None:
@@ -88,7 +97,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
     return shown
 
 
-def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[Heard]:
+def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[TimestampedMessage]:
     """The messages of a drive; velocities are noted as they pass."""
     for m in hear(bag, names):
         kind = {names.command: 'commanded', names.odometry: 'measured'}.get(m.topic)

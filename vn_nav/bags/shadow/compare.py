@@ -35,6 +35,9 @@ class Shadow:
 
     answers: list[Answer]
     commands: dict[int, np.ndarray]  # by time of recording [ns]: [4], the last of that time
+    # Of the policy's action filter, as the node's last diagnostics had them: `decisions`, and at
+    # how many it `acted` and `changed` the action; None: it has none, or an older node drove.
+    filtered: dict[str, int] | None = None
 
     @property
     def beside_the_drive(self) -> tuple[int, int]:
@@ -74,6 +77,7 @@ class Comparison:
     first: Disagreement | None
     longest: list[Disagreement]
     latency: dict[str, dict[str, float]]  # s, of each: median, p95
+    filtered: dict[str, dict[str, int] | None]  # of each, see `Shadow`
 
 
 def read_shadow(bag: str | Path) -> Shadow:
@@ -86,9 +90,11 @@ def read_shadow(bag: str | Path) -> Shadow:
     told: dict[int, tuple[int, str | None]] = {}  # episode, and what was done before
     choices: dict[int, str] = {}
     commands: dict[int, np.ndarray] = {}
+    filtered: dict[str, int] | None = None
     episode = -1
     for record in messages(bag, [f'shadow/{name}' for name in (
-            'action', 'action_names', 'arrived', 'cmd_vel', 'executed_action', 'goal_image')]):
+            'action', 'action_names', 'arrived', 'cmd_vel', 'diagnostics', 'executed_action',
+            'goal_image')]):
         time = record.log_time
         match record.topic.rpartition('/')[2]:
             case 'action_names':
@@ -101,6 +107,8 @@ def read_shadow(bag: str | Path) -> Shadow:
                 choices[time] = names[record.message.data]
             case 'arrived' if record.message.data:
                 choices[time] = ARRIVED
+            case 'diagnostics':
+                filtered = _filtered(record.message) or filtered
             case 'cmd_vel':
                 commands[time] = twist_to_array(record.message)
     if not told:
@@ -109,7 +117,23 @@ def read_shadow(bag: str | Path) -> Shadow:
     following = {one: told[other][1] for one, other in itertools.pairwise(told)
                  if told[one][0] == told[other][0]}
     return Shadow([Answer(time, own, choices[time], following.get(time))
-                   for time, (own, _) in told.items() if time in choices], commands)
+                   for time, (own, _) in told.items() if time in choices], commands, filtered)
+
+
+def _filtered(diagnostics) -> dict[str, int] | None:
+    """The counts of the action filter, where a node says them."""
+    said = {pair.key: pair.value for status in diagnostics.status for pair in status.values}
+    names = 'decisions', 'acted', 'changed'
+    if not all(said.get(f'filter_{name}', '').isdecimal() for name in names):
+        return None
+    return {name: int(said[f'filter_{name}']) for name in names}
+
+
+def filter_words(counts: dict[str, int] | None) -> str:
+    """What an action filter did, in a few words."""
+    return 'none' if counts is None else (
+        f'acted at {counts["acted"]} of {counts["decisions"]} decisions, changed '
+        f'{counts["changed"]}')
 
 
 def compare(a: Shadow, b: Shadow, labels: tuple[str, str],
@@ -150,7 +174,8 @@ def compare(a: Shadow, b: Shadow, labels: tuple[str, str],
         disagreements=len(runs), first=runs[0] if runs else None,
         longest=sorted(runs, key=lambda run: (-run.decisions, run.begins))[:LISTED],
         latency={name: {'median': float(np.median(own)), 'p95': float(np.quantile(own, 0.95))}
-                 for name, own in zip('ab', latencies, strict=True) if own})
+                 for name, own in zip('ab', latencies, strict=True) if own},
+        filtered={'a': a.filtered, 'b': b.filtered})
 
 
 def _disagreements(pairs: list[tuple[Answer, Answer]], start: int) -> list[Disagreement]:
@@ -196,6 +221,9 @@ def figures(found: Comparison) -> list[tuple[str, str]]:
             f'{label} {found.latency[key]["median"] * 1e3:.0f} ms (p95 '
             f'{found.latency[key]["p95"] * 1e3:.0f})'
             for key, label in (('a', found.a), ('b', found.b)) if key in found.latency)),
+        *([] if not any(found.filtered.values()) else [('action filter', '; '.join(
+            f'{label} {filter_words(found.filtered[key])}'
+            for key, label in (('a', found.a), ('b', found.b))))]),
         ('disagreements', f'{found.disagreements} stretches')]
     if any(found.alone.values()):
         rows.insert(1, ('made by one alone', f'{found.a} {found.alone["a"]}, '

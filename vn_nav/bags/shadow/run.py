@@ -15,6 +15,7 @@ from vn_nav.bags.shadow.compare import (
     compare,
     confusion_table,
     figures,
+    filter_words,
     markdown,
     read_shadow,
 )
@@ -118,7 +119,10 @@ def _told(folder: Path, driven) -> str:
     same, known = shadow.beside_the_drive
     arrived = sum(answer.choice == ARRIVED for answer in shadow.answers)
     return (f'{len(shadow.answers)} decisions, {same} of {known} as the drive, arrived '
-            f'{arrived} times, {len(shadow.commands)} commands; latency '
+            f'{arrived} times, {len(shadow.commands)} commands; '
+            + ('' if shadow.filtered is None
+               else f'action filter: {filter_words(shadow.filtered)}; ')
+            + 'latency '
             f'{np.median(driven.latencies) * 1e3:.0f} ms (p95 '
             f'{np.quantile(driven.latencies, 0.95) * 1e3:.0f})')
 
@@ -126,8 +130,9 @@ def _told(folder: Path, driven) -> str:
 def _compare(outs: list[Path], folders: list[Path], latencies: list[list[float]], out: Path
              ) -> None:
     same = folders[0].name == folders[1].name
-    labels = tuple(str(folder) if same else folder.name for folder in folders)
-    found = compare(read_shadow(outs[0]), read_shadow(outs[1]), labels, tuple(latencies))
+    one, other = (str(folder) if same else folder.name for folder in folders)
+    found = compare(read_shadow(outs[0]), read_shadow(outs[1]), (one, other),
+                    (latencies[0], latencies[1]))
     for name, text in (('comparison.json', as_json(found)), ('comparison.md', markdown(found))):
         try:
             write_file(out / name, text.encode())
