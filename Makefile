@@ -7,6 +7,7 @@
 #   make soak      faults by the hundred: killed trainings, damaged bags and pictures, lost cameras,
 #                  signals, an hour of driving (three hours in all)
 #   make lint      ruff, and the linters of ROS
+#   make docs      the documentation as a site: build/docs/index.html
 #   make clean     remove what was built: the environment, caches, the demonstration's output
 #
 # Another Python: make PYTHON=python3.12 demo
@@ -16,6 +17,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 READY_ALL := $(VENV)/.ready-all
+READY_DOCS := $(VENV)/.ready-docs
 SOURCES := setup.py launch test vn_msgs_py vn_nav vn_sim_bridge
 
 # A sourced ROS, or another virtual environment of ROS wheels, shadows ours with its modules,
@@ -30,7 +32,7 @@ export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 export FASTRTPS_DEFAULT_PROFILES_FILE := $(CURDIR)/config/fastdds_localhost.xml
 export ROS_AUTOMATIC_DISCOVERY_RANGE := SYSTEM_DEFAULT
 
-.PHONY: demo test test-all soak lint clean
+.PHONY: demo test test-all soak lint docs clean
 
 demo: $(READY)
 	@$(BIN)/vn_nav demo
@@ -62,12 +64,19 @@ soak: $(READY)
 
 lint: $(READY)
 	@$(BIN)/python -m ruff check .
+	@$(BIN)/python -m ruff check --target-version py312 --select E9,F .
 	@report=$$($(BIN)/ament_flake8 $(SOURCES) 2>&1) || { echo "$$report"; exit 1; }
 	@report=$$($(BIN)/ament_pep257 --convention google --add-ignore D101 D102 D103 D105 D107 D417 --\
 	 $(SOURCES) 2>&1) || { echo "$$report"; exit 1; }
 
+# Strict: a link that leads nowhere, or a docstring that cannot be read, is an error.
+docs: $(READY_DOCS)
+	@$(BIN)/python -m sphinx -b html -W --keep-going -q -d build/docs_cache docs build/docs
+	@echo "build/docs/index.html"
+
 clean:
-	@rm -rf $(VENV) build install log dist demo .pytest_cache .ruff_cache .hypothesis *.egg-info
+	@rm -rf $(VENV) build install log dist demo docs/generated .pytest_cache .ruff_cache .hypothesis\
+	 *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Editable: a change of the sources needs no new set-up. An environment whose Python is gone, or
@@ -92,4 +101,8 @@ $(READY): setup.py constraints.txt
 # a video encoder and Parquet.
 $(READY_ALL): $(READY)
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot]'
+	@touch $@
+
+$(READY_DOCS): $(READY)
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	@touch $@

@@ -6,6 +6,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'vn_nav'
+PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 EXECUTABLES = {
     'vn_nav': 'vn_nav.cli:main',
     'goal_node': 'vn_nav.cli.nodes:goal_node',
@@ -53,7 +54,7 @@ if 'bdist_wheel' in sys.argv:  # pip builds; colcon reads setup.cfg
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='0.2.0',
     description='Visual navigation for ROS 2: shown a picture, a robot drives to its place.',
     long_description='Learned visual navigation for ROS 2, its simulator and its trainer.',
     maintainer='vn_nav maintainers',
@@ -61,7 +62,8 @@ setup(
     license='Apache-2.0',
     packages=find_packages(include=[
         f'{package}{suffix}'
-        for package in ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py') for suffix in ('', '.*')]),
+        for package in PACKAGES for suffix in ('', '.*')]),
+    package_data={package: ['py.typed'] for package in PACKAGES},  # PEP 561: they have types
     data_files=data_files,
     zip_safe=False,
     python_requires='>=3.11',
@@ -88,6 +90,12 @@ setup(
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`
         'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels
+        'docs': [  # `make docs`
+            'sphinx>=8.2',
+            'myst-parser>=4',
+            'furo>=2024.8.6',
+            'sphinx-copybutton>=0.5',
+        ],
         'test': [
             'pytest>=8',
             'pytest-timeout>=2.3',

@@ -51,8 +51,10 @@ def test_pip_install(prefix):
             assert (share / source).read_bytes() == (ROOT / source).read_bytes(), source
     for package in ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py'):
         sources = {path.relative_to(ROOT) for path in (ROOT / package).rglob('*.py')}
+        sources.add((ROOT / package / 'py.typed').relative_to(ROOT))  # PEP 561
         installed = {path.relative_to(packages_of(prefix))
-                     for path in (packages_of(prefix) / package).rglob('*.py')}
+                     for path in (packages_of(prefix) / package).rglob('*.*')
+                     if path.suffix in ('.py', '.typed')}
         assert installed == sources
 
     # `ros2 run` looks in lib/vn_nav and starts what is executable there.
@@ -82,7 +84,8 @@ def test_the_ament_index_finds_it(prefix):
 def test_one_version_everywhere():
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text()).group(1)
-    assert manifest.find('version').text == setup == vn_nav.__version__
+    citation = re.search(r'^version: (.+)$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE)
+    assert manifest.find('version').text == setup == vn_nav.__version__ == citation.group(1)
 
 
 def test_the_manifest_names_every_ros_package_that_is_imported():

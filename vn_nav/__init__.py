@@ -1,3 +1,3 @@
 """Visual navigation for ROS 2: show a robot a picture, and it drives to where it was taken."""
 
-__version__ = '0.1.0'
+__version__ = '0.2.0'
