@@ -120,6 +120,7 @@ def test_late_and_repeated_pictures_are_left_out():
 
 def test_depth_belongs_to_the_picture_of_its_stamp():
     messages, _ = drive([(0.3, 0.0, 2.0)], rate=10.0)
+
     def depth(heard):
         stamp = heard.message.header.stamp
         return Message('/depth/image_raw', picture(stamp.sec + stamp.nanosec * 1e-9 + 0.004),
