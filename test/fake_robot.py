@@ -5,16 +5,18 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_harness import wait_until
+from ros_harness import PATIENCE, ask, child, wait_until
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Bool
@@ -24,11 +26,17 @@ from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import fill_odometry, twist_to_array
 from vn_nav.nodes.qos import qos
 
+NODE = 'vn_nav.nodes.policy_node'
 CAMERA_HZ = 30.0
 ODOMETRY_HZ = 50.0
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+AFTER = {  # what a lifecycle node is after a transition
+    Transition.TRANSITION_CONFIGURE: 'inactive', Transition.TRANSITION_ACTIVATE: 'active',
+    Transition.TRANSITION_DEACTIVATE: 'inactive', Transition.TRANSITION_CLEANUP: 'unconfigured',
+    Transition.TRANSITION_ACTIVE_SHUTDOWN: 'finalized'}
 
 
 class FakeRobot:
@@ -44,6 +52,7 @@ class FakeRobot:
         commands: (steady time, [4] velocity) of every Twist.
         statuses: (steady time, level, message, {key: value}) from /diagnostics.
         offset: added to the stamps of the pictures [s].
+        focal: what camera_info says [pixels].
         sends: what is published: 'image', 'odom', 'clock'.
     """
 
@@ -68,6 +77,8 @@ class FakeRobot:
                                       qos('/diagnostics'))
         self.sends = {'image', 'odom', 'clock'}
         self.offset, self.begun = 0.0, time.monotonic() - 10.0
+        self.focal = min(size or (84, 84)) / 2  # 90 deg
+        self._clients = {}
         self.pose = np.zeros(3)
         self._due = dict.fromkeys(self.sends, 0.0)
         self._rng = np.random.default_rng(0)
@@ -126,7 +137,7 @@ class FakeRobot:
             self.publish_odometry()
         if self.image is not None and self._is_due('image', CAMERA_HZ):
             info = CameraInfo(width=self.size[0], height=self.size[1])
-            info.k[0] = min(self.size) / 2  # 90 deg
+            info.k[0] = self.focal
             self.info.publish(info)
             self.image.publish(self.picture())
         self.executor.spin_once(timeout_sec=0.002)
@@ -146,22 +157,27 @@ class FakeRobot:
         end = time.monotonic() + seconds
         wait_until(lambda: time.monotonic() > end, self.spin, seconds + 10)
 
+    def _ask(self, kind, name, **fields):
+        """`ros_harness.ask`; one client a service, for each new one has to be found."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, f'/policy_node/{name}')
+        return ask(self._clients[name], kind.Request(**fields), self.spin)
+
     def call(self, kind, name, **fields):
-        """Call a service of the policy while the robot goes on."""
-        client = self.node.create_client(kind, f'/policy_node/{name}')
-        wait_until(client.service_is_ready, self.spin)
-        future = client.call_async(kind.Request(**fields))
-        wait_until(future.done, self.spin)
-        self.node.destroy_client(client)
-        return future.result()
+        """Call a service of the policy while the robot goes on; its answer."""
+        return self._ask(kind, name, **fields)[0]
+
+    def state(self):
+        """The node's lifecycle state, by its label."""
+        return self.call(GetState, 'get_state').current_state.label
 
     def transition(self, number):
         """Ask for a lifecycle transition; whether it succeeded."""
-        request = ChangeState.Request()
-        request.transition.id = number
-        return self.call(ChangeState, 'change_state', transition=request.transition).success
+        answer, asked = self._ask(ChangeState, 'change_state', transition=Transition(id=number))
+        # Asked again because the first answer was lost: then it is done, and refused as unknown.
+        return answer.success or (asked > 1 and self.state() == AFTER[number])
 
-    def enable(self, seconds=60.0):
+    def enable(self, seconds=PATIENCE):
         """Enable as soon as the node agrees; the last refusal before that."""
         answers = ['']
 
@@ -190,7 +206,7 @@ class FakeRobot:
         self.enable()
         wait_until(self.moving, self.spin)
 
-    def wait_for_zero(self, seconds=2.0):
+    def wait_for_zero(self, seconds=PATIENCE):
         """Spin until the last command is zero; when the first zero after the motion came."""
         wait_until(lambda: self.commands and not self.moving(), self.spin, seconds)
         first = self.commands[-1][0]
@@ -200,11 +216,14 @@ class FakeRobot:
             first = at
         return first
 
-    def says(self, words, seconds=5.0):
-        """Spin until a status has these words in its message or values; that status."""
+    def says(self, *words, seconds=PATIENCE):
+        """Spin until a status has one of these words in its message or values; that status.
+
+        A loaded machine has more than one reason to stand still: name each that is right.
+        """
         def matching():
-            return [status for status in self.statuses
-                    if words in status[2] or any(words in value for value in status[3].values())]
+            return [status for status in self.statuses if any(
+                word in text for word in words for text in (status[2], *status[3].values()))]
         begun = time.monotonic()
         while not matching():
             assert time.monotonic() - begun < seconds, (words, self.statuses[-1:])
@@ -215,6 +234,40 @@ class FakeRobot:
         """Take it off the graph."""
         self.executor.shutdown()
         self.node.destroy_node()
+
+
+@contextmanager
+def robot_and_node(checkpoint, tmp_path, *, node=None, robot=None):
+    """A fake robot beside the node as a process: (robot, process)."""
+    rclpy.init()
+    fake = FakeRobot(**(robot or {}))
+    try:
+        with child(NODE, tmp_path / 'log', checkpoint=checkpoint, **(node or {})) as process:
+            yield fake, process
+    finally:
+        fake.close()
+        rclpy.shutdown()
+
+
+@contextmanager
+def broken_node(checkpoint, tmp_path, fault, **parameters):
+    """A fake robot beside a node with a fault that is put into its process: (robot, process)."""
+    words = [f'checkpoint:={checkpoint}', *(f'{k}:={v}' for k, v in parameters.items())]
+    arguments = ['--ros-args', *(word for pair in words for word in ('-p', pair))]
+    script = f'{fault}\nimport sys\nfrom vn_nav.nodes.policy_node import main\nsys.exit(main())'
+    rclpy.init()
+    fake = FakeRobot(odometry=RELIABLE)
+    with open(tmp_path / 'log', 'w') as log:
+        process = subprocess.Popen([sys.executable, '-c', script, *arguments], stdout=log,
+                                   stderr=log, env=os.environ | {'OMP_NUM_THREADS': '1'})
+    try:
+        yield fake, process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        fake.close()
+        rclpy.shutdown()
 
 
 class OtherCamera:

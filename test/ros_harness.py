@@ -10,10 +10,13 @@ import time
 
 import torch
 
+from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.floor.contacts import WORLD_VERSION
+
+PATIENCE = 100.0  # s for what has no limit of its own: starting a node on a loaded machine
 
 
 def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=None, **fields):
@@ -55,10 +58,21 @@ def child(module, log, *, rules=(), **parameters):
             process.wait()
 
 
-def wait_until(condition, spin, seconds=60.0):
-    """Call `spin` until the condition holds; the seconds it took."""
+def wait_until(condition, spin, seconds=PATIENCE, what=''):
+    """Call `spin` until the condition holds; the seconds it took. `what` tells of a failure."""
     begun = time.monotonic()
     while not condition():
-        assert time.monotonic() - begun < seconds, f'not within {seconds} s'
+        assert time.monotonic() - begun < seconds, f'not within {seconds} s: {what or condition}'
         spin()
     return time.monotonic() - begun
+
+
+def ask(client, request, spin, seconds=PATIENCE):
+    """The answer of a service, and how often it was asked: again where none comes.
+
+    What may not be done twice is to be asked of a client that has had an answer before.
+    """
+    wait_until(client.service_is_ready, spin, seconds, f'{client.srv_name} is not there')
+    call = ServiceCall(client, request)
+    wait_until(call.is_answered, spin, seconds, f'{client.srv_name} does not answer')
+    return call.answer, call.asked

@@ -146,7 +146,7 @@ def _raw_array(message: Any, allowed: tuple[str, ...]) -> np.ndarray:
     if len(message.data) != step * rows:
         raise ImageError(f'data has step x rows = {step * rows} bytes', len(message.data),
                          'the message is truncated or mislabelled: check the camera driver')
-    data = np.frombuffer(message.data, np.uint8).reshape(rows, step)
+    data: np.ndarray = np.frombuffer(message.data, np.uint8).reshape(rows, step)
     if encoding.planes == 3.0:
         return data  # two of its rows of padding may lie together
     data = data[:, :row_bytes]

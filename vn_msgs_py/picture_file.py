@@ -18,7 +18,7 @@ REDUCED = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_RED
            8: cv2.IMREAD_REDUCED_COLOR_8}
 JPEG_SIGNATURE = b'\xff\xd8\xff'
 FOREIGN = ((b'GIF8', 'GIF'), (b'BM', 'BMP'), (b'II*\0', 'TIFF'), (b'MM\0*', 'TIFF'),
-           (b'RIFF', 'WebP'), (b'\xff\x0a', 'JPEG XL'), (b'\0\0\0\x0cJXL ', 'JPEG XL'),
+           (b'\xff\x0a', 'JPEG XL'), (b'\0\0\0\x0cJXL ', 'JPEG XL'),
            (b'\0\0\0\x0cjP  ', 'JPEG 2000'))  # by the first bytes
 HEIF_BRANDS = (b'heic', b'heix', b'heim', b'heis', b'hevc', b'hevx', b'mif1', b'msf1')
 
@@ -83,6 +83,8 @@ def _name_format(data: bytes) -> str:
         brand = data[8:12]
         return ('HEIC' if brand in HEIF_BRANDS else 'AVIF' if brand in (b'avif', b'avis')
                 else f'a file of brand {brand!r}')
+    if data[:4] == b'RIFF' and data[8:12] == b'WEBP':  # sounds and films begin alike
+        return 'WebP'
     for signature, name in FOREIGN:
         if data.startswith(signature):
             return name

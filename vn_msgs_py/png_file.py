@@ -55,7 +55,8 @@ def examine_png(data: bytes) -> PngFile:
     if len(data) < 33:
         raise _truncated(f'{len(data)} bytes without an end chunk')
     shape = _read_header(data[16:29])
-    header, pixels, orientation, at, chunks = [SIGNATURE], [], 1, 8, 0
+    header, orientation, at, chunks = [SIGNATURE], 1, 8, 0
+    pixels: list[tuple[int, int]] = []  # where the chunks of pixels begin and end
     while True:
         chunks += 1
         if chunks > MAX_CHUNKS:
@@ -191,7 +192,8 @@ def _inflate(data: bytes, png: PngFile) -> tuple[list[bytes], bytes]:
 
 def _store(parts: list[bytes], checksum: bytes) -> None:
     """Make an IDAT chunk of the rows, in place: they are stored, not compressed."""
-    blocks, size = [], 6
+    blocks: list[bytes] = []
+    size = 6
     for part in parts:
         for at in range(0, len(part), STORED_BYTES):
             block = part[at:at + STORED_BYTES]  # itself, where it is no longer

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import shlex
 from pathlib import Path
 
@@ -13,6 +15,11 @@ from vn_nav.errors import UserError
 
 MAX_FILE_BYTES = 128_000_000
 MAX_JPEG_PX = 256_000_000  # of a phone's largest camera; decoded at a reduced size
+TEXT_BYTES = 256  # that are looked at to tell text from something else
+READ_BY_IMAGEMAGICK = {  # by the names of `ForeignFormatError`, its own names
+    'HEIC': 'heic', 'AVIF': 'avif', 'GIF': 'gif', 'BMP': 'bmp', 'TIFF': 'tiff', 'WebP': 'webp',
+    'JPEG XL': 'jxl', 'JPEG 2000': 'jp2'}
+SEVERAL = ('GIF', 'TIFF', 'WebP')  # may hold several pictures
 KEPT_SIDE_PX = 1000  # of the shorter side: no policy sees more of a picture
 
 
@@ -26,7 +33,6 @@ def read_goal_picture(path: Path) -> np.ndarray:
         UserError: there is no such file, or it holds something else.
     """
     rule = 'a goal picture is a JPEG or PNG file'
-    source, target = (shlex.quote(str(name)) for name in (path, path.with_suffix('.jpg')))
     if not path.is_file():
         raise UserError(rule, f'{path}: no such file', 'give another one')
     try:
@@ -39,10 +45,8 @@ def read_goal_picture(path: Path) -> np.ndarray:
     try:
         return decode_picture(data, smallest=KEPT_SIDE_PX, largest=MAX_JPEG_PX)
     except ForeignFormatError as error:
-        remedy = f'convert it: `convert {source} {target}` (ImageMagick)'
-        if error.received == 'HEIC':
-            remedy += ', or in Python with pillow-heif'
-        raise UserError(rule, f'{path}: {error.received}', remedy) from error
+        kind = _received(data, error)
+        raise UserError(rule, f'{path}: {kind}', _conversion(path, kind)) from error
     except TooLargeError as error:
         raise UserError(f'{rule}; {error.rule}', f'{path}: {error.received}',
                         _smaller(path)) from error
@@ -51,7 +55,46 @@ def read_goal_picture(path: Path) -> np.ndarray:
                         'copy the file again, or give another one') from error
 
 
+def _received(data: bytes, error: ForeignFormatError) -> str:
+    """What a file that is neither JPEG nor PNG holds, in words."""
+    if not data:
+        return 'an empty file'
+    try:
+        text = data[:TEXT_BYTES].decode('utf-8')
+    except UnicodeDecodeError as broken:  # the last letter may be cut
+        text = data[:broken.start].decode('utf-8') if broken.start > TEXT_BYTES - 4 else ''
+    if text and all(letter.isprintable() or letter in '\t\r\n' for letter in text):
+        return f'text that begins with {text.strip()[:20]!r}'
+    return str(error.received)
+
+
+def _conversion(path: Path, kind: str) -> str:
+    """How to make a JPEG of a file; out of what is no picture none can be made."""
+    if kind not in READ_BY_IMAGEMAGICK:
+        return 'copy it again, or give another one'
+    # By its kind, whatever the name says; of several pictures the first one.
+    source = shlex.quote(f'{READ_BY_IMAGEMAGICK[kind]}:{path}' + '[0]' * (kind in SEVERAL))
+    target = shlex.quote(_argument(_beside(path)))
+    return f'convert it: `convert {source} {target}` (ImageMagick)' + (
+        ', or in Python with pillow-heif' if kind == 'HEIC' else '')
+
+
+def _beside(path: Path, word: str = '') -> Path:
+    """A JPEG beside a file whose name is free: a command overwrites what is there."""
+    for number in itertools.count():
+        more = '_'.join(filter(None, (word, str(number) if number else '')))
+        found = path.with_name(f'{path.stem}{f"_{more}" if more else ""}.jpg')
+        if not os.path.lexists(found):
+            return found
+    raise AssertionError('names without end')
+
+
+def _argument(path: Path) -> str:
+    """A path as an argument of a command: one that begins with - would be an option."""
+    return f'./{path}' if str(path).startswith('-') else str(path)
+
+
 def _smaller(path: Path) -> str:
-    target = path.with_name(f'{path.stem}_small.jpg')
-    return (f'make it smaller: `convert {shlex.quote(str(path))} -auto-orient -resize 2000x2000 '
-            f'{shlex.quote(str(target))}` (ImageMagick)')
+    source, target = (shlex.quote(_argument(name)) for name in (path, _beside(path, 'small')))
+    return (f'make it smaller: `convert {source} -auto-orient -resize 2000x2000 {target}` '
+            '(ImageMagick)')

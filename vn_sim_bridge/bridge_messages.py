@@ -21,6 +21,7 @@ from vn_sim_bridge.robot.simulated_robot import TICK, Decision, Episode, Simulat
 LIDAR_HEIGHT = 0.2  # m above the floor; the scan is the same at any height
 # What a flat floor fixes: z [m], roll, pitch [rad]. Small, as of a filter for two dimensions.
 FLAT = 1e-8
+Numbers = Sequence[float] | np.ndarray
 
 
 class Frames(NamedTuple):
@@ -49,13 +50,13 @@ class Transform(NamedTuple):
     rotation: tuple[float, float, float, float]
 
 
-def planar(parent: str, child: str, pose: Sequence[float]) -> Transform:
+def planar(parent: str, child: str, pose: Numbers) -> Transform:
     """A frame at x, y [m], yaw [rad] on the floor of its parent."""
     x, y, yaw = (float(value) for value in pose[:3])
     return Transform(parent, child, (x, y, 0.0), motion.yaw_to_quaternion(yaw))
 
 
-def odom_in_map(true: Sequence[float], odometry: Sequence[float]) -> tuple[float, float, float]:
+def odom_in_map(true: Numbers, odometry: Numbers) -> tuple[float, float, float]:
     """Pose x, y, yaw of the odom frame in the map, where the robot is at both poses [>=3]."""
     yaw = float(wrap_angle(true[2] - odometry[2]))
     c, s = math.cos(yaw), math.sin(yaw)
@@ -72,8 +73,8 @@ def static_transforms(frames: Frames) -> list[Transform]:
             Transform(frames.camera, frames.optical, (0.0, 0.0, 0.0), (-0.5, 0.5, -0.5, 0.5))]
 
 
-def moving_transforms(frames: Frames, odometry: Sequence[float], *, camera_height: float,
-                      pitch: float, true: Sequence[float] | None = None) -> list[Transform]:
+def moving_transforms(frames: Frames, odometry: Numbers, *, camera_height: float,
+                      pitch: float, true: Numbers | None = None) -> list[Transform]:
     """What moves: the base in odom, the camera that tilts, and odom in the map.
 
     Args:
@@ -98,7 +99,7 @@ def fill_transform(message: Any, transform: Transform) -> Any:
     return message
 
 
-def goal_in_map(message: Any, frames: Frames, true: Sequence[float], odometry: Sequence[float]
+def goal_in_map(message: Any, frames: Frames, true: Numbers, odometry: Numbers
                 ) -> tuple[float, float, float]:
     """A goal as x, y [m], yaw [rad] in the map, from a PoseStamped.
 
@@ -136,7 +137,7 @@ def fill_covariances(message: Any, uncertainty: Uncertainty) -> Any:
     return message
 
 
-def fill_scan(message: Any, rects: np.ndarray, pose: Sequence[float], period: float) -> Any:
+def fill_scan(message: Any, rects: np.ndarray, pose: np.ndarray, period: float) -> Any:
     """Write a scan (`lidar.scan`) into a LaserScan; the header stays the caller's.
 
     Args:
@@ -173,6 +174,7 @@ def scene_facts(robot: SimulatedRobot) -> dict:
 def episode_facts(robot: SimulatedRobot, stamp: float) -> dict:
     """What the topic `episode` says at a beginning, with its simulated time [s]."""
     episode = robot.episode
+    assert episode is not None  # one has just begun
     return {'episode': episode.index, 'goal': episode.goal, 'room': robot.goal.room,
             'goal_pose': list(robot.goal.pose), 'start': list(episode.start),
             'start_distance': episode.start_distance, 'stamp': stamp,

@@ -80,7 +80,8 @@ class Sensors:
         for name, message, pose, frame in (
                 ('ground_truth/odom', self._truth, robot.pose, frames.map),
                 ('odom', self._odometry, robot.odometry, frames.odom)):
-            motion.fill_odometry(message, *pose[:3], robot.velocity)
+            x, y, yaw = pose[:3]
+            motion.fill_odometry(message, x, y, yaw, robot.velocity)
             if name == 'odom':
                 bridge_messages.fill_covariances(message, robot.uncertainty)
             message.child_frame_id = frames.base

@@ -54,17 +54,17 @@ def _hash(*keys) -> np.ndarray:
     return state
 
 
-def key(seed: int, stream: Stream, env, episode, step=0) -> np.ndarray:
+def key(seed: int | np.ndarray, stream: Stream, env, episode, step=0) -> np.ndarray:
     """64 random bits, uint64; integer arguments broadcast."""
     return _hash(seed, stream, env, episode, step)
 
 
-def uniform(seed: int, stream: Stream, env, episode, step=0) -> np.ndarray:
+def uniform(seed: int | np.ndarray, stream: Stream, env, episode, step=0) -> np.ndarray:
     """Uniform in [0, 1), float64; integer arguments broadcast."""
     return (_hash(seed, stream, env, episode, step) >> np.uint64(11)) * 2.0**-53
 
 
-def normal(seed: int, stream: Stream, env, episode, step=0) -> np.ndarray:
+def normal(seed: int | np.ndarray, stream: Stream, env, episode, step=0) -> np.ndarray:
     """Standard normal, float64, by Box and Muller's transform; integer arguments broadcast."""
     first = _hash(seed, stream, env, episode, step, 0)
     second = _hash(seed, stream, env, episode, step, 1)

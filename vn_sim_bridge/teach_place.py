@@ -91,7 +91,7 @@ def regrets(graph: ImageGraph, poses: np.ndarray, until: float = math.inf,
     Returns:
         [G,N,A] float16, from the poses to the first G of the goals, one at least.
     """
-    found = []
+    found: list[np.ndarray] = []
     for goal in graph.goals:
         if found and time.monotonic() > until:
             break
@@ -103,7 +103,7 @@ def regrets(graph: ImageGraph, poses: np.ndarray, until: float = math.inf,
 def draw_map(path: Path, own: ImageGraph, others: ImageGraph | None) -> None:
     """A map as PNG: floor, pictures, goals to learn (blue) and to judge by (orange); y upwards."""
     free = own.floor.free
-    plan = np.where(free[:, :, None], np.uint8(FLOOR), np.uint8(BLOCKED))
+    plan = np.where(free[:, :, None], np.array(FLOOR, np.uint8), np.array(BLOCKED, np.uint8))
     plan = np.ascontiguousarray(plan.repeat(PIXELS, axis=0).repeat(PIXELS, axis=1))
 
     def place(x: float, y: float) -> tuple[int, int]:

@@ -331,4 +331,23 @@ def test_a_topic_of_another_type_is_one_error_in_every_command(
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert f'the {role} of a bag is' in line and f'{topic}: {kind}' in line
     found = diagnose(bag, topics=load_topics(names))
-    assert any(f.topic == topic and f'is {kind}, not' in f.what for f in found.findings)
+    (finding,) = (f for f in found.findings if f.topic == topic and f'is {kind}, not' in f.what)
+    assert f'{role}: null' in finding.remedy  # the other of odometry and commands is there
+
+
+def test_what_the_reader_went_on_with_is_noted(tmp_path, capsys):
+    path, figures = tmp_path / 'a.mcap', tmp_path / 'figures.json'
+    write(path, drive(), enable_crcs=False)
+    assert cli.main(['bag', 'doctor', str(path), '--json', str(figures)]) == 0
+    told = ' '.join(capsys.readouterr().out.split())
+    (note,) = diagnose(path).notes
+    assert 'no checksums' in note and f'note: {note}' in told and 'ok: nothing' in told
+    assert json.loads(figures.read_text())['notes'] == [note]
+    write(path, drive(1.0), finish=False)
+    data = path.read_bytes()
+    at = 17 + int.from_bytes(data[9:17], 'little')  # behind the header
+    path.write_bytes(data[:at] + b'\x99' + (5).to_bytes(8, 'little') + b'mine!' + data[at:])
+    assert cli.main(['bag', 'doctor', str(path)]) == 1
+    told = ' '.join(capsys.readouterr().out.split())
+    assert any('0x99 (14 bytes)' in note and note in told for note in diagnose(path).notes)
+    assert diagnose(write(tmp_path / 'b.mcap', drive(1.0))).notes == []

@@ -1,11 +1,15 @@
 """A bag's folder is read whole or refused, with a command that really converts it."""
 
+import contextlib
 import gzip
+import os
 import re
 import shlex
 import shutil
+import sqlite3
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -179,9 +183,166 @@ def test_every_command_prints_the_remedy(tmp_path, capsys, monkeypatch, command)
     assert not (tmp_path / 'out').exists() or not any((tmp_path / 'out').iterdir())
 
 
+@pytest.mark.parametrize('name, words', [
+    ('r_3.bag.active', 'rosbag reindex'), ('r_3.mcap.active', 'vn_nav bag recover'),
+    ('r_3.mcap.part', 'vn_nav bag recover'), ('r_3.MCAP.crdownload', 'vn_nav bag recover'),
+    ('r_3.db3-wal', 'copy r_3.db3 beside it'), ('r_3.db3.part', 'finish its copy'),
+    ('r_3.mcap.tar.gz', 'tar -xf'), ('r_3.mcap.tgz', 'tar -xf'), ('r_3.mcap.zip', 'unzip'),
+    ('r_3.mcap.7z', '7z x'), ('r_3.mcap.bak', 'rename it'), ('r_3.mcap.1', 'rename it'),
+    ('r_3.mcap~', 'rename it'), ('r_3.MCAP.ZST', r'zstd -d .*/\*\.MCAP\.ZST'),
+    ('r_3.DB3', r'rosbags-convert --src .*/\*\.DB3 --dst .*bag_mcap')])
+@pytest.mark.parametrize('listed', [False, True])
+def test_unfinished_and_packed_recordings_are_refused_by_name(tmp_path, name, words, listed):
+    folder = splits(tmp_path / 'bag')
+    if listed:
+        (folder / 'metadata.yaml').write_text(METADATA % ('r_0.mcap, r_1.mcap, r_2.mcap', ''))
+    Bag(folder)
+    (folder / name).write_bytes(b'whatever')
+    error = refusal(folder, re.escape(name))
+    assert re.search(words, error.remedy) and 'one MCAP file to read that alone' in error.remedy
+    if '.mcap.' in name:  # the finished or unpacked one is there: this is its copy
+        (folder / name).rename(folder / name.replace('r_3', 'r_2'))
+        assert len(list(messages(folder))) == len(SENT)
+
+
+def test_a_recording_is_known_by_its_first_bytes(tmp_path):
+    folder = splits(tmp_path / 'bag')
+    (folder / 'r_2.mcap').rename(folder / 'r_2.uploading')
+    refusal(folder, 'r_2.uploading: an MCAP file by its first bytes.*rename it')
+    listed = folder / 'metadata.yaml'
+    listed.write_text(METADATA % ('r_0.mcap, r_1.mcap, r_2.uploading', ''))
+    assert len(list(messages(folder))) == len(SENT)  # it is a name that somebody gave it
+    listed.unlink()
+    (folder / 'r_2.uploading').rename(folder / 'third')
+    refusal(folder, 'third: an MCAP file by its first bytes')
+    ros1(folder / 'x.bag').rename(folder / 'third')
+    refusal(folder, 'third: a bag of ROS 1 by its first bytes')
+
+
+def test_what_recover_saves_of_an_unfinished_file_is_read_with_the_others(tmp_path):
+    folder = splits(tmp_path / 'my bag')
+    last = folder / 'r_2.mcap'
+    (folder / 'r_2.mcap.active').write_bytes(last.read_bytes()[:-60])  # without its end
+    last.unlink()
+    remedy = refusal(folder, 'r_2.mcap.active').remedy
+    words = shlex.split(re.search('`(.*?)`', remedy).group(1))
+    assert words[:3] == ['vn_nav', 'bag', 'recover'] and cli.main(words[1:]) == 0
+    assert len(list(messages(folder))) == len(SENT)
+
+
+def cannot_be_read(folder, kind):
+    """A folder whose r_1.mcap is there and cannot be read."""
+    path = splits(folder) / 'r_1.mcap'
+    if kind in ('link', 'folder', 'pipe'):
+        path.unlink()
+    if kind == 'link':
+        path.symlink_to('/gone/r_1.mcap')
+    elif kind == 'folder':
+        path.mkdir()
+    elif kind == 'pipe':
+        os.mkfifo(path)  # reading it would never end
+    elif kind == 'empty':
+        path.write_bytes(b'')
+    return path
+
+
+@pytest.mark.parametrize('listed', [False, True])
+@pytest.mark.parametrize('kind, words', [
+    ('link', 'is a link to /gone/r_1.mcap, which is not there.*cp -rL'), ('folder', 'is a folder'),
+    ('pipe', 'is no file'), ('empty', 'is empty')])
+def test_a_file_that_cannot_be_read_is_named(tmp_path, kind, words, listed):
+    path = cannot_be_read(tmp_path / 'bag', kind)
+    if listed:
+        (path.parent / 'metadata.yaml').write_text(
+            METADATA % ('r_0.mcap, r_1.mcap, r_2.mcap', ''))
+    with pytest.raises(BagError, match=f'r_1.mcap: {words}.*bag recover') as error:
+        Bag(path.parent)
+    assert error.value.path == path
+    assert any('r_1.mcap' in finding.what for finding in diagnose(path.parent).findings)
+    recovered = recover(path.parent, tmp_path / 'out')
+    assert any('r_1.mcap' in line for line in recovered.lines())
+    assert recovered.lost or kind == 'empty'
+    assert sum(recovered.counts.values()) == 2 * len(SENT) // 3
+    if kind != 'folder':  # alone
+        with pytest.raises(BagError, match=words.split('.*')[0]):
+            Bag(path)
+
+
+def test_a_file_without_permission_is_named(tmp_path):
+    with tempfile.TemporaryDirectory() as place:  # not below a folder of root's
+        os.chmod(place, 0o755)
+        folder = splits(Path(place, 'bag'))
+        os.chmod(folder / 'r_1.mcap', 0)
+        own = os.geteuid()
+        try:
+            if own == 0:
+                os.seteuid(65534)
+            with pytest.raises(BagError, match='r_1.mcap: cannot be read .*permissions.*recover'):
+                Bag(folder)
+            assert any('r_1.mcap' in f.what for f in diagnose(folder).findings)
+        finally:
+            os.seteuid(own)
+
+
+def test_a_split_that_is_missing_by_the_numbers_is_named(tmp_path):
+    folder = splits(tmp_path / 'r')
+    (folder / 'r_1.mcap').rename(tmp_path / 'r_1.mcap')
+    with pytest.raises(BagError, match='r_1.mcap: is not there, by the numbers') as error:
+        Bag(folder)
+    assert f'vn_nav bag recover {folder} NEW' in error.value.remedy
+    assert any('r_1.mcap' in finding.what for finding in diagnose(folder).findings)
+    recovered = recover(folder, tmp_path / 'out')
+    assert recovered.lost and any('r_1.mcap' in line for line in recovered.lines())
+    (tmp_path / 'r_1.mcap').rename(folder / 'r_1.mcap')
+    Bag(folder)
+    (folder / 'r_0.mcap').unlink()
+    with pytest.raises(BagError, match='r_0.mcap: is not there'):
+        Bag(folder)
+    folder.rename(tmp_path / 'mine')  # then r_1 may be its owner's first
+    assert len(list(messages(tmp_path / 'mine'))) == 2 * len(SENT) // 3
+    for names in ('a_2024_01_02 a_2024_01_05', 'a_1700000000 a_1700000600', 'a_7 b_9', 'a1 a3'):
+        other = splits(tmp_path / names)
+        for k, name in enumerate(names.split()):  # dates are no numbers of splits
+            (other / f'r_{k}.mcap').rename(other / f'{name}.mcap')
+        (other / 'r_2.mcap').unlink()
+        assert len(list(messages(other))) == 2 * len(SENT) // 3
+
+
+@pytest.mark.slow
+def test_what_sqlite_has_not_yet_put_into_its_file_is_converted_too(tmp_path):
+    folder = recorded(tmp_path / 'my bag', StoragePlugin.SQLITE3)
+    path = next(folder.glob('*.db3'))
+    kept = {}
+    with contextlib.closing(sqlite3.connect(path)) as base:
+        base.execute('PRAGMA journal_mode=WAL')
+        base.execute('INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, '
+                     'timestamp + 5, data FROM messages WHERE topic_id = 1')
+        base.commit()
+        kept = {file.name: file.read_bytes() for file in folder.iterdir()}
+    for name, data in kept.items():
+        (folder / name).write_bytes(data)  # as a killed recorder leaves it
+    assert kept[f'{path.name}-wal']
+    with contextlib.closing(sqlite3.connect(f'file:{path}?immutable=1', uri=True)) as base:
+        (before,) = base.execute('SELECT count(*) FROM messages').fetchone()
+    assert before == len(SENT)  # as the converter reads it
+    command = re.search('`(.*)`', refusal(folder, 'a bag is a folder').remedy).group(1)
+    assert 'wal_checkpoint' in refusal(path, 'a bag in SQLite').remedy
+    (folder / 'metadata.yaml').rename(tmp_path / 'metadata.yaml')
+    assert 'wal_checkpoint' in refusal(folder, 'a bag in SQLite').remedy
+    (tmp_path / 'metadata.yaml').rename(folder / 'metadata.yaml')
+    if shutil.which('sqlite3') is None:
+        pytest.skip('expected: sqlite3 is not installed')
+    program = Path(sys.executable).with_name('rosbags-convert')
+    subprocess.run(['sh', '-c', command.replace('rosbags-convert', str(program), 1)],
+                   check=True, capture_output=True)
+    assert len(list(messages(tmp_path / 'my bag_mcap'))) > len(SENT)
+
+
 def test_other_things_in_the_folder_do_no_harm(tmp_path):
     folder = splits(tmp_path / 'bag')
-    for name in ('notes.txt', 'map.png', 'x.mcap.md5', 'archive.zst'):
+    for name in ('notes.txt', 'map.png', 'x.mcap.md5', 'archive.zst', 'README', 'map.db',
+                 'metadata.yaml.bak', 'metadata.yaml~', '.r_3.mcap.Xy12', '._r_0.mcap',
+                 'x.bag.yaml'):
         (folder / name).write_bytes(b'')
     (folder / 'old').mkdir()
     write(folder / 'old' / 'x.mcap', [('/a', STRING, 10**18, make(STRING))])

@@ -346,6 +346,17 @@ def test_a_disk_that_fails_a_write_leaves_a_whole_bag(tmp_path):
     assert bag.written.total() == information(tmp_path / 'bag')['message_count'] < taken
 
 
+def test_a_failure_for_which_the_system_has_no_words_stops_a_recording_too(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError('the card is gone')  # no number: strerror is None
+
+    monkeypatch.setattr(McapOutput, 'add', fail)
+    bag = BagWriter(tmp_path / 'bag', [TEXT])
+    bag.write('scene', text(20, 0), START)
+    with pytest.raises(RecordingStopped, match='OSError: the card is gone'):
+        bag.close()
+
+
 def test_no_bag_is_begun_without_room(tmp_path):
     with pytest.raises(UserError, match='GB free'):
         BagWriter(tmp_path / 'bag', [TEXT], min_free=1 << 50)

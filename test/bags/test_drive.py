@@ -336,6 +336,28 @@ def test_a_role_whose_topic_has_another_type_is_refused_with_one_that_has_it(rol
     assert '/other' in error.value.remedy and '--topics' in error.value.remedy
 
 
+@pytest.mark.parametrize('role, other', [('odometry', 'command'), ('command', 'odometry')])
+def test_odometry_and_commands_stand_in_for_each_other(tmp_path, role, other):
+    wrong = {f'/{role}': 'geometry_msgs/msg/PoseStamped'}
+    names = {'image': '/image', 'odometry': '/odometry', 'command': '/command'}
+    with pytest.raises(UserError, match=f'the {role} of a bag is') as error:
+        Topics(**names).within(typed(image='/image', **{other: f'/{other}'}) | wrong)
+    assert f'`{role}: null`' in error.value.remedy and '--topics' in error.value.remedy
+    (tmp_path / 'topics.yaml').write_text(''.join(
+        f'{known}: {name}\n' for known, name in names.items() if known != role)
+        + f'{role}: null\n')  # as it says
+    left = load_topics(tmp_path / 'topics.yaml').within(
+        typed(image='/image', **{other: f'/{other}'}) | wrong)
+    assert getattr(left, role) == '' and getattr(left, other) == f'/{other}'
+    with pytest.raises(UserError, match=f'the {role} of a bag is') as error:  # nothing stands in
+        Topics(**names).within(typed(image='/image') | wrong)
+    assert 'null' not in error.value.remedy
+    with pytest.raises(UserError) as error:
+        Topics(**names).within(typed(image='/image') | wrong | {
+            f'/{other}': 'geometry_msgs/msg/PoseStamped'})
+    assert 'null' not in error.value.remedy
+
+
 def test_types_without_msg_are_the_same_types_and_a_role_can_be_left_out(tmp_path):
     assert full_name('nav_msgs/Odometry') == full_name('nav_msgs/msg/Odometry')
     assert Topics().within({'/image_raw': 'sensor_msgs/Image',

@@ -1,5 +1,8 @@
 """Goal pictures as people bring them: from phones, too large, in other formats."""
 
+import shlex
+from pathlib import Path
+
 import cv2
 import numpy as np
 import picture_bytes
@@ -63,13 +66,43 @@ def test_a_file_without_end_is_not_read_to_its_end(tmp_path, monkeypatch):
     refused(path, '1000 bytes')
 
 
+HEIC = b'\0\0\0\x24ftypheic\0\0\0\0mif1MiHBheic'
+
+
 def test_other_formats_are_named_with_the_command(tmp_path):
     path = tmp_path / 'IMG 1.HEIC'
-    path.write_bytes(b'\0\0\0\x24ftypheic\0\0\0\0mif1MiHBheic')
-    refused(path, 'HEIC', f"`convert '{path}' '{path.with_suffix('.jpg')}'`", 'pillow-heif')
+    path.write_bytes(HEIC)
+    refused(path, 'HEIC', f"`convert 'heic:{path}' '{path.with_suffix('.jpg')}'`", 'pillow-heif')
     path = tmp_path / 'goal.jpg'  # the name says nothing
     path.write_bytes(b'RIFF\0\0\0\0WEBPVP8 ')
-    refused(path, 'WebP', 'convert')
+    refused(path, 'WebP', f"`convert 'webp:{path}[0]' ")
+
+
+@pytest.mark.parametrize('name', ['goal.jpg', "it's $HOME.jpg", '-goal.jpg', 'a.b.heic'])
+@pytest.mark.parametrize('data', [HEIC, b'GIF89a\x08\0\x08\0', png(8000, 6000, zeros(8000))])
+def test_no_command_overwrites_a_file(tmp_path, monkeypatch, name, data):
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(data)
+    (tmp_path / 'a.b.jpg').write_bytes(b'')  # its owner's
+    with pytest.raises(UserError) as caught:
+        read_goal_picture(Path(name))
+    words = shlex.split(caught.value.remedy.split('`')[1])
+    assert words[0] == 'convert' and name in words[1] and not words[-1].startswith('-')
+    assert not Path(words[-1]).exists() and Path(words[-1]).suffix == '.jpg'
+
+
+@pytest.mark.parametrize('data, words', [
+    (b'', 'an empty file'), (b'<!DOCTYPE html>\n<html>' * 20, "begins with '<!DOCTYPE"),
+    (b'BMW\n', "text that begins with 'BMW'"),
+    *((('x' * k + 'gr\u00fc\u00df' * 99).encode(), 'text that begins') for k in range(3)),
+    (b'RIFF\x24\0\0\0WAVEfmt ', "begin with b'RIFF"), (b'\0\0\0\x20ftypisom', 'isom')])
+def test_what_is_no_picture_gets_no_conversion(tmp_path, data, words):
+    path = tmp_path / 'goal.jpg'
+    path.write_bytes(data)
+    refused(path, words, 'give another one')
+    with pytest.raises(UserError) as caught:
+        read_goal_picture(path)
+    assert 'convert' not in str(caught.value)
 
 
 @pytest.mark.parametrize('name', ['a gigabyte behind the rows of a small PNG', 'two frame headers',

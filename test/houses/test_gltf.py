@@ -348,6 +348,47 @@ def test_what_is_required_and_not_known_is_refused_by_name(tmp_path, name, words
     assert load_mesh(file.write(tmp_path / 'a.glb')).triangle_count == 2
 
 
+@pytest.mark.parametrize('asset, words', [
+    ({'version': '2.0'}, None), ({'version': '2.7'}, None),
+    ({'version': '2.0', 'minVersion': '2.0'}, None),
+    ({'version': '2.1', 'minVersion': '2.0'}, None),
+    ({'version': '2.0', 'minVersion': '1.0'}, None),
+    ({'version': '2.1', 'minVersion': '2.1'}, "minVersion '2.1'"),
+    ({'version': '2.0', 'minVersion': '3.0'}, "minVersion '3.0'"),
+    ({'version': '2.0', 'minVersion': '2.10'}, "minVersion '2.10'"),
+    ({'version': '2.0', 'minVersion': 'new'}, "minVersion 'new'"),
+    ({'version': '2.0', 'minVersion': None}, "minVersion 'None'"),
+    ({'version': '1.0'}, "version '1.0'"), ({'version': '3.0'}, "version '3.0'"),
+    ({'version': '2'}, "version '2'"), ({'version': '2.x'}, "version '2.x'"),
+    ({'version': '20.0'}, "version '20.0'"), ({}, 'no version'), (None, 'no version'),
+    ([], 'no version'), ('2.0', 'no version')])
+def test_what_demands_more_than_2_0_is_refused(tmp_path, asset, words):
+    file = Gltf()
+    file.node(file.square())
+    file.json['asset'] = asset
+    if asset is None:
+        del file.json['asset']
+    path = file.write(tmp_path / 'a.glb')
+    if words is None:
+        assert load_mesh(path).triangle_count == 2
+        return
+    with pytest.raises(UserError, match='glTF 2.0') as caught:
+        load_mesh(path)
+    assert words in caught.value.received and 'Error' not in str(caught.value)
+
+
+@pytest.mark.parametrize('version', [1, 3])
+def test_another_version_of_the_container_is_refused(tmp_path, version):
+    file = Gltf()
+    file.node(file.square())
+    path = file.write(tmp_path / 'a.glb')
+    data = bytearray(path.read_bytes())
+    data[4] = version
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=f'glTF 2.0; .*GLB version {version}'):
+        load_mesh(path)
+
+
 def test_compressed_data_without_a_plain_copy_are_refused_by_name(tmp_path):
     file = Gltf()
     file.node(file.square())

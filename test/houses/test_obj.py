@@ -103,7 +103,7 @@ def test_colours_of_vertices_multiply_kd(tmp_path):
 @pytest.mark.parametrize('line, picture, words', [
     ('map_Kd wood.png', None, 'wood.png'), ('map_Kd C:\\tex\\wood.png', 'wood.png', 'C:'),
     ('map_Kd -s 1 1 1', 'wood.png', 'wall.obj'), ('Kd spectral a.rfl', None, 'Kd'),
-    ('map_Kd', None, 'wall.obj')])
+    ('map_Kd', None, 'wall.mtl, line 3')])
 def test_a_missing_texture_is_an_error_and_not_white(tmp_path, line, picture, words):
     with pytest.raises(UserError, match=words):
         load_mesh(write(tmp_path, line, picture=picture), up='z')
@@ -158,3 +158,46 @@ def test_indices_from_the_end_and_lines_that_go_on(tmp_path):
     path.write_text('o wall_1\ncstype bezier\nsurf 0 1 0 1\n')
     with pytest.raises(UserError, match='polygons'):
         load_mesh(path)
+
+
+@pytest.mark.parametrize('line', [
+    'Kd', 'Kd 1 1', 'Kd red', 'Kd 1 nan 1', 'Kd 1 1 x', 'Kd spectral a.rfl', 'map_Kd', 'map_kd\t',
+    'newmtl', 'map_Kd -s', 'map_Kd -s wood.png', 'map_Kd -s 1 1 1 absent.png', 'map_Kd -clamp on',
+    'map_Kd -clamp wood.png', 'map_Kd -clamp maybe wood.png', 'map_Kd -blendu 3 wood.png',
+    'map_Kd -s nan 1 wood.png', 'map_Kd -o inf wood.png', 'map_Kd -foo 1 wood.png',
+    'map_Kd -mm 1 wood.png', 'map_Kd -t 1 wood.png', 'map_Kd absent.png'])
+def test_a_broken_line_of_a_library_is_one_error_that_names_it(tmp_path, line):
+    with pytest.raises(UserError) as caught:
+        load_mesh(write(tmp_path, line), up='z')
+    text = str(caught.value)
+    assert 'wall.mtl, line 3: ' in text and 'Error' not in text and '\n' not in text
+
+
+@pytest.mark.parametrize('line', ['Kd 1 1 1', 'map_Kd wood.png'])
+def test_a_line_that_belongs_to_no_material_is_one_error(tmp_path, line):
+    path = write(tmp_path)
+    (tmp_path / 'wall.mtl').write_text(f'# a comment \\\nthat goes on\n{line}\n{MATERIAL}')
+    with pytest.raises(UserError, match='wall.mtl, line 3: .*no newmtl'):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize('line', [
+    'v', 'v 1 2', 'v a b c', 'vt', 'vt x', 'f', 'f 1 2', 'f 1 2 x', 'f 1 2 3.5', 'f 0 1 2',
+    'f 1 2 9', 'f 1 2 -9', 'f 1/9 2/1 3/1', 'f 1/0 2/1 3/1', 'f / / /', f'f 1 2 {10**30}',
+    'mtllib', 'mtllib absent.mtl', 'surf 0 1', 'f 1/1 2/-5 3/1'])
+def test_a_broken_line_of_a_mesh_is_one_error_that_names_it(tmp_path, line):
+    path = tmp_path / 'a.obj'
+    path.write_text(f'o wall_1\nv 0 0 0\nv 1 0 0\nv 0 0 1\nvt 0 0\nf 1 \\\n2 3\n{line}\nf 1 2 3\n')
+    with pytest.raises(UserError) as caught:
+        load_mesh(path, up='z')
+    text = str(caught.value)
+    assert 'a.obj, line 8: ' in text and 'Error' not in text and '\n' not in text
+
+
+def test_keywords_without_a_meaning_for_surfaces_may_be_bare(tmp_path):
+    path = tmp_path / 'a.obj'
+    path.write_text('mg\ns\ng\no wall_1\nv 0 0 0\nv 1 0 0\nv 0 0 1\nvn\nusemtl\nf 1 2 3\n')
+    assert load_mesh(path, up='z').triangle_count == 2
+    path.write_text('o wall_1\nv 0 0 0 nan 1 1\nv 1 0 0 1 1 1\nv 0 0 1 1 1 1\nf 1 2 3\n')
+    with pytest.raises(UserError, match='colours of vertices are finite'):
+        load_mesh(path, up='z')

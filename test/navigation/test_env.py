@@ -64,8 +64,39 @@ def test_a_list_of_seeds_gives_each_environment_its_own():
                for a, later in zip(chosen, seen[1:], strict=True))
     env.reset(seed=[None, 7, None])  # the others go on with their own
     env.reset(seed=np.array([1, 2, 3]))
-    for wrong in ([1, 2], [1, 2, 3, 4], [1, 2, 'x'], [1, 2, 3.5], -1, 'x'):
-        with pytest.raises(UserError, match='seed'):
+    env.reset(seed=range(3))
+    env.reset(seed=[np.int64(1), np.uint8(2), None])
+    before = env.get_state()
+    for wrong in ([1, 2], [1, 2, 3, 4], [1, 2, 'x'], [1, 2, 3.5], [1, 2, -3], [True, False, True],
+                  np.array([True, False, True]), np.zeros((3, 1), int), [[1], 2, 3], [[1]] * 3,
+                  [1, 2, 1 << 63], [], ()):
+        with pytest.raises(UserError, match='seed is .*or 3 of them'):
+            env.reset(seed=wrong)
+    for wrong in (-1, 'x', 3.5, True, 1 << 63, np.array(-1), {1, 2, 3}, {}, np.float64(1)):
+        with pytest.raises(UserError, match='a seed is a whole number'):
+            env.reset(seed=wrong)
+    after = env.get_state()  # nothing has begun
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_options_that_are_none_are_one_error():
+    env, single = make(num_envs=2), HouseNavigation(house=7, size=36)
+    env.reset(seed=0)
+    for wrong in (5, 'reset_mask', [1], True, {'reset_maks': [True] * 2}, {'seed': 3},
+                  {'reset_mask': [[1], 2]}, {5: 1}):
+        with pytest.raises(UserError, match='option|reset_mask'):
+            env.reset(options=wrong)
+        with pytest.raises(UserError, match='no options'):
+            single.reset(options=wrong)
+
+
+def test_the_seed_of_a_single_environment():
+    env = HouseNavigation(house=7, size=36)
+    one, _ = env.reset(seed=np.int64(3), options={})
+    two, _ = env.reset(seed=3)
+    assert np.array_equal(one['image'], two['image'])
+    for wrong in (-1, True, [3], 'x', 2.0, np.array(True)):
+        with pytest.raises(UserError, match='a seed is a whole number'):
             env.reset(seed=wrong)
 
 

@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_harness import child, wait_until, write_checkpoint
+from ros_harness import PATIENCE, ask, child, wait_until, write_checkpoint
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, LaserScan
 from std_msgs.msg import Bool, Float32, String, UInt8
@@ -71,7 +71,7 @@ class Listener:
 
     def hears(self, name, count):
         """Wait for so many messages on a topic; the newest."""
-        wait_until(lambda: len(self.heard[name]) >= count, self.spin, 20)
+        wait_until(lambda: len(self.heard[name]) >= count, self.spin)
         assert len(self.heard[name]) == count
         return self.heard[name][-1]
 
@@ -89,9 +89,9 @@ class Listener:
             self.command.publish(fill_twist(Twist(), velocity))
             # One tick for one command; what still comes of the rest before is not its answer.
             wait_until(lambda: self.pose('odom')[6] > before and (  # noqa: B023
-                moving or self.pose('odom')[3:6].any()), self.spin, 20)  # noqa: B023
+                moving or self.pose('odom')[3:6].any()), self.spin)  # noqa: B023
         # Each topic has its own way here: what stands on one may still be under way on another.
-        wait_until(lambda: self.pose()[6] >= self.pose('odom')[6], self.spin, 20)
+        wait_until(lambda: self.pose()[6] >= self.pose('odom')[6], self.spin)
         return self.hears('reward', rewards + 1).data
 
     def pose(self, name='ground_truth/odom'):
@@ -143,6 +143,7 @@ def test_reset_takes_the_goal_pose_and_refuses_a_wall(listener, tmp_path):
         publisher = listener.node.create_publisher(PoseStamped, 'goal_pose', qos('goal_pose'))
         wait_until(lambda: client.service_is_ready() and publisher.get_subscription_count(),
                    listener.spin)
+        ask(client, Trigger.Request(), listener.spin)  # from now on no answer is lost
         goal = json.loads(listener.heard['scene'][0].data)['goals'][2]['pose']
 
         def reset(x, y):
@@ -182,7 +183,7 @@ def test_no_message_kills_it_and_limits_are_kept(listener, tmp_path):
             listener.command.publish(twist)
             listener.spin()
         client = listener.node.create_client(Trigger, '/sim_bridge_node/reset')
-        wait_until(client.service_is_ready, listener.spin)
+        ask(client, Trigger.Request(), listener.spin)  # from now on no answer is lost
         goals = [goal['pose'] for goal in json.loads(listener.heard['scene'][0].data)['goals']]
 
         def reset(frame, pose, *, scale=1.0):
@@ -259,9 +260,7 @@ def test_it_reads_stamped_commands_and_drives_freely(listener, tmp_path):
         assert listener.heard['odom'][-1].header.frame_id == 'r2/odom'
         assert listener.heard['ground_truth/odom'][-1].header.frame_id == 'map'
         client = listener.node.create_client(Trigger, '/sim_bridge_node/reset')
-        future = client.call_async(Trigger.Request())
-        wait_until(future.done, listener.spin)
-        assert future.result().success
+        assert ask(client, Trigger.Request(), listener.spin)[0].success
         wait_until(lambda: math.dist(listener.pose()[:2], before[:2]) > 0.1, listener.spin)
         for name in ('goal_image', 'episode', *OUTCOMES):
             assert not listener.heard[name], f'{name} belongs to episodes'
@@ -313,7 +312,7 @@ def test_a_restarted_bridge_shows_a_goal_with_another_stamp(listener, tmp_path):
             goal = listener.heard['goal_image'][-1]
             stamps.append((goal.header.stamp.sec, goal.header.stamp.nanosec))
             bridge.send_signal(signal.SIGINT)
-            assert bridge.wait(20) == 0
+            assert bridge.wait(PATIENCE) == 0
         listener.heard['goal_image'].clear()
     assert len(set(stamps)) == 4 and sorted(stamps[:2]) == stamps[:2]
     assert abs(stamps[0][0] - time.time()) < 300 and stamps[3][0] < 86_400
@@ -354,7 +353,7 @@ def test_in_lock_step_a_stop_at_full_speed_is_rest_within_the_limits(listener, t
             before, moving = listener.pose('odom')[6], listener.pose('odom')[5] != 0
             listener.command.publish(message)
             wait_until(lambda: listener.pose('odom')[6] > before and (
-                moving or listener.pose('odom')[5] != 0), listener.spin, 20)
+                moving or listener.pose('odom')[5] != 0), listener.spin)
             return listener.pose('odom')[5]
         speeds = [answer(message) for _ in range(14)]
         assert speeds == pytest.approx([min(0.08 * (k + 1), 0.8) for k in range(14)])
@@ -366,7 +365,7 @@ def test_in_lock_step_a_stop_at_full_speed_is_rest_within_the_limits(listener, t
         for _ in range(5):
             answer(message)
         begun = time.monotonic()
-        wait_until(lambda: listener.pose('odom')[5] == 0.0, listener.spin, 20)  # silence
+        wait_until(lambda: listener.pose('odom')[5] == 0.0, listener.spin)  # silence
         assert 1.5 < time.monotonic() - begun < 10.0
 
 
@@ -496,7 +495,7 @@ def test_the_robot_ends_the_episode_when_stops_are_declared(listener, journey, t
         say(True)  # nobody takes it back: it is meant
         assert listener.hears('episode_end', 3).data == 1
         assert time.monotonic() - said > 1.0
-        assert bridge.wait(20) == 0
+        assert bridge.wait(PATIENCE) == 0
 
 
 @pytest.mark.slow
@@ -514,10 +513,10 @@ def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
                    lambda: time.sleep(0.1))
         with child('vn_nav.nodes.policy_node', tmp_path / 'policy.log', checkpoint=checkpoint,
                    time='lock_step', robot=DEMO_BASE, auto_enable=True, seed=5) as policy:
-            bridge.wait(100)
+            bridge.wait(PATIENCE)
             for process in (policy, recorder):
                 process.send_signal(signal.SIGINT)
-                assert process.wait(20) == 0
+                assert process.wait(PATIENCE) == 0
     drive = drives_from_bag(tmp_path / 'bag')[0]
     actions = [(record.stamp, record.message.data)
                for record in read_bag(tmp_path / 'bag', ('action',))]

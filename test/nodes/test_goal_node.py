@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from ros_harness import child, wait_until
+from ros_harness import PATIENCE, child, wait_until
 from sensor_msgs.msg import Image
 
 from vn_msgs_py.images import decode_rgb
@@ -35,7 +35,7 @@ def test_a_late_listener_gets_the_picture(tmp_path):
             wait_until(lambda: heard, lambda: executor.spin_once(timeout_sec=0.1))
             assert np.array_equal(decode_rgb(heard[0]), picture[:, :, ::-1])
             process.send_signal(signal.SIGINT)
-            assert process.wait(10) == 0
+            assert process.wait(PATIENCE) == 0
             node.destroy_node()
     finally:
         rclpy.shutdown()

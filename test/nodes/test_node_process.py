@@ -12,7 +12,7 @@ import pytest
 import rclpy
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.executors import SingleThreadedExecutor
-from ros_harness import child, wait_until
+from ros_harness import PATIENCE, ask, child, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
@@ -103,11 +103,10 @@ def test_allowed_words_and_limits_stand_in_descriptors(tmp_path):
     try:
         with child(NODES['policy_node'], tmp_path / 'log', autostart=False):
             client = node.create_client(DescribeParameters, '/policy_node/describe_parameters')
-            wait_until(client.service_is_ready, lambda: executor.spin_once(timeout_sec=0.1))
-            future = client.call_async(DescribeParameters.Request(
-                names=['mode', 'control_rate', 'decoding']))
-            wait_until(future.done, lambda: executor.spin_once(timeout_sec=0.1))
-            mode, rate, decoding = future.result().descriptors
+            answer, _ = ask(client, DescribeParameters.Request(
+                names=['mode', 'control_rate', 'decoding']),
+                lambda: executor.spin_once(timeout_sec=0.1))
+            mode, rate, decoding = answer.descriptors
             assert mode.additional_constraints == 'one of stop_and_go, continuous, shadow'
             assert decoding.additional_constraints == 'one of (empty), sample, greedy'
             assert rate.floating_point_range[0].to_value == 100.0
@@ -131,7 +130,7 @@ def test_many_signals_end_a_node_with_exit_code_0(name, number, tmp_path):
         while process.poll() is None and time.monotonic() < until:
             process.send_signal(number)
             time.sleep(0.002)
-        assert process.wait(10) == 0, log.read_text()
+        assert process.wait(PATIENCE) == 0, log.read_text()
     assert 'Traceback' not in log.read_text()
 
 
@@ -162,7 +161,7 @@ def test_nohup_still_means_that_a_closed_session_does_not_end_it(tmp_path):
         time.sleep(1.5)
         assert process.poll() is None
         process.send_signal(signal.SIGTERM)
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE) == 0
     finally:
         process.kill()
         process.wait()
@@ -197,5 +196,5 @@ def test_the_first_compilation_shows_progress_and_can_be_ended(number, tmp_path,
     with child(NODES['sim_bridge_node'], log, house=7) as process:
         wait_until(lambda: 's so far' in log.read_text(), lambda: time.sleep(0.05), 120)
         process.send_signal(number)
-        assert process.wait(20) == 0, log.read_text()
+        assert process.wait(PATIENCE) == 0, log.read_text()
     assert 'Traceback' not in log.read_text() and 'ready' not in log.read_text()

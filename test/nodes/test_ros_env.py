@@ -17,7 +17,7 @@ import torch
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
-from ros_harness import child, wait_until
+from ros_harness import PATIENCE, child, wait_until
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Bool, UInt8
 
@@ -27,10 +27,11 @@ from vn_nav.bags.dataset import Wanted, load_drives
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.drive import integrate
 from vn_nav.cli import main
-from vn_nav.cli.train import config_over_ros
 from vn_nav.errors import EnvironmentLost, UserError
+from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, preset
-from vn_nav.learning.trainer import STATE, train
+from vn_nav.learning.trainer import train
+from vn_nav.learning.training import STATE
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.ros_env import RosEnv
 from vn_nav.policy.checkpoint import load_checkpoint
@@ -232,14 +233,14 @@ def test_a_silent_camera_pauses_a_training_that_then_goes_on_and_at_last_ends(tm
         wait_for(lambda: said(tmp_path).count('steps/s') > lines + 1, process, tmp_path)
         assert said(tmp_path).count('goes on after') > pauses
         simulator.kill()
-        assert process.wait(60) == 2, said(tmp_path)
+        assert process.wait(PATIENCE) == 2, said(tmp_path)
     last = said(tmp_path).strip().splitlines()[-1]
     assert last.startswith('vn_nav: a robot is ready again within 12 s') and 'resume' in last
     assert load_checkpoint(tmp_path / 'run' / 'checkpoint').info['frames'] >= 16
     assert (tmp_path / 'run' / STATE).is_file()
 
 
-def wait_for(condition, process, tmp_path, seconds=60.0):
+def wait_for(condition, process, tmp_path, seconds=PATIENCE):
     """Until a condition holds, while the process runs."""
     until = time.monotonic() + seconds
     while not condition():
@@ -261,9 +262,9 @@ def test_a_signal_leaves_zero_and_a_checkpoint(robot, tmp_path, number):
         wait_until(lambda: 'steps/s' in said(tmp_path) and robot.moves, alive)
         process.send_signal(number)
         sent = time.monotonic()
-        wait_until(lambda: not robot.moves, alive, 3)
+        wait_until(lambda: not robot.moves, robot.spin)
         assert robot.commands[-1][0] - sent < 0.5
-        wait_until(lambda: process.poll() is not None, robot.spin, 30)
+        wait_until(lambda: process.poll() is not None, robot.spin)
         assert process.returncode == 0, said(tmp_path)
         assert not robot.moves
     assert 'goal_pose is left out' in said(tmp_path)
@@ -340,15 +341,15 @@ def test_a_robot_whose_eyes_or_command_are_in_doubt_stands_still(robot, capsys):
                 outcomes.append(env.step([0]))
             thread = threading.Thread(target=step)
             thread.start()
-            wait_until(lambda: robot.moves, lambda: time.sleep(0.005), 20)
+            wait_until(lambda: robot.moves, lambda: time.sleep(0.005))
             disturbed = disturb()
-            wait_until(lambda: not robot.moves, lambda: time.sleep(0.005), 5)
+            wait_until(lambda: not robot.moves, lambda: time.sleep(0.005))
             heard = len(robot.commands)
-            wait_until(lambda: 'paused' in capsys.readouterr().out, lambda: time.sleep(0.05), 20)
+            wait_until(lambda: 'paused' in capsys.readouterr().out, lambda: time.sleep(0.05))
             assert not any(velocity.any() for _, velocity in robot.commands[heard:])
             assert not outcomes
             restore(disturbed)
-            thread.join(20)
+            thread.join(PATIENCE)
             assert outcomes[0][3][0], 'a motion that was broken off truncates the episode'
             env.step([0])  # the next one begins, towards the same goal
     assert not robot.moves

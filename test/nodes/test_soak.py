@@ -144,7 +144,7 @@ def test_signals(make_robot, checkpoint, tmp_path):
             asked = time.monotonic()
             os.kill(process.pid, numbers[trial % 4])
             late.append(1e3 * (robot.wait_for_zero() - asked))
-            wait_until(lambda process=process: process.poll() is not None, robot.spin, 15)
+            wait_until(lambda process=process: process.poll() is not None, robot.spin)
             assert process.returncode == 0, (tmp_path / 'log').read_text()
             assert not robot.moving()
     row = figure('zero after a signal', late, 'ms', signals='INT TERM HUP QUIT')

@@ -85,7 +85,7 @@ def divide(stamps: np.ndarray, breaks: list[Break], odometry: bool = True) -> St
         number += begins
         reasons[k + 1] = cut.reason
     for k in np.flatnonzero(np.diff(run) if odometry else
-                            (np.diff(run) != 0) | (np.diff(stamps) > SILENCE)):
+                            (np.diff(run) != 0) | (np.diff(stamps) > SILENCE)).tolist():
         if number[k] == number[k + 1]:
             reasons = {n + (n > number[k]): why for n, why in reasons.items()}
             reasons[number[k] + 1] = ('the stamps of pictures go back' if run[k] != run[k + 1] else

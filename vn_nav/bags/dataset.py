@@ -13,7 +13,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
@@ -43,6 +43,17 @@ class Wanted:
     threads: int = 2  # that decode
 
 
+class Pictures(Protocol):
+    """Rows that are read when they are asked for: an array, or `one_place.Rows` of one."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, chosen: Any, /) -> np.ndarray: ...
+
+
 @dataclasses.dataclass
 class DriveSet:
     """The steps of a bag. N steps, S pixels a side, G goal pictures, A actions of the robot.
@@ -51,14 +62,14 @@ class DriveSet:
     memory-mapped: what is not looked at takes no memory.
     """
 
-    image: np.ndarray  # [N,3,S,S] uint8
+    image: Pictures  # [N,3,S,S] uint8
     pose: np.ndarray  # [N,3] float64 x, y [m], yaw [rad] in the frame of the odometry
     time: np.ndarray  # [N] float64 s, stamps
     action: np.ndarray  # [N] int16, that begins here; `drive.MISFIT`: none, or the end
     episode: np.ndarray  # [N] int64
     goal: np.ndarray  # [N] int64 into goals, -1: no goal was shown
     goals: np.ndarray  # [G,3,S,S] uint8
-    depth: np.ndarray | None  # [N,S,S] uint8, 255 at `MAX_DEPTH`, 0 where unknown
+    depth: Pictures | None  # [N,S,S] uint8, 255 at `MAX_DEPTH`, 0 where unknown
     labels: np.ndarray | None  # [N,S,S] uint8 class ids
     facts: dict  # what the bag held and what did not fit
 
@@ -186,7 +197,9 @@ class _Columns:
     """Arrays that grow on disk, row by row."""
 
     def __init__(self, folder: Path):
-        self._folder, self._files, self._layout = folder, {}, {}
+        self._folder = folder
+        self._files: dict[str, BinaryIO] = {}
+        self._layout: dict[str, dict[str, Any]] = {}
 
     def append(self, name: str, row: np.ndarray) -> None:
         if name not in self._files:
@@ -212,7 +225,8 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
     steps, facts = read_steps(bag, wanted, report)
     beside = {name: _Beside(name) for name in ('depth', 'labels') if facts['topics'][name]}
     goals: dict[bytes, int] = {}
-    shown_goal, number, bad, unseen, rows = None, -1, 0, 0, []
+    shown_goal, number, bad, unseen = None, -1, 0, 0
+    rows: list[list[float]] = []
     held = summary(bag)[facts['topics']['image']].count or math.inf
     for step, pictures in decoded(steps, wanted, facts['fov']):
         show(report.pictures / held)

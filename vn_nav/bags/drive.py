@@ -219,7 +219,7 @@ class _DeadReckoning:
         self._pose = np.zeros(3)
         self._velocity = np.zeros(3)
         self._from = -math.inf  # when the velocity was heard
-        self._at = None  # time of the pose
+        self._at: float | None = None  # time of the pose
         self._past: collections.deque[tuple[float, np.ndarray]] = collections.deque()
 
     def hear(self, message: Any, time: float) -> None:
@@ -313,6 +313,7 @@ class Cutter:
         yield from self._end()
 
     def _go_on(self, frame: Frame) -> Iterator[Step]:
+        assert self._begin is not None  # `cut` began with a frame
         moved = _relative(self._begin.pose, frame.pose)
         action, misfit = self._fit(moved)
         if misfit < (math.inf if self._best is None else self._best[0]):
@@ -330,6 +331,7 @@ class Cutter:
 
     def _finish(self) -> Iterator[Step]:
         """End the action where it fitted best, and go on from there."""
+        assert self._best is not None  # else there is no end
         _, action, end = self._best
         rest, self._since, self._best = self._since, [], None
         yield self._step(action, end)
@@ -337,6 +339,7 @@ class Cutter:
             yield from self._go_on(frame)
 
     def _step(self, action: int, end: Frame) -> Step:
+        assert self._begin is not None  # an action ends that began there
         step = Step(self._begin, action, False)
         if action == MISFIT:
             self._report.misfits += 1
@@ -348,7 +351,7 @@ class Cutter:
     def _end(self) -> Iterator[Step]:
         while self._best is not None:
             yield from self._finish()
-        if self._begin is not None:
+        if self._begin is not None and self._last is not None:
             # What is left over is a motion of its own, unless it is next to none.
             moved = np.abs(_relative(self._begin.pose, self._last.pose)) / self._unit
             if moved.max() >= MIXED:

@@ -58,10 +58,11 @@ class Topics:
                 name = f'{name}/compressed'
             found[role] = there.get(name, '')
         free = {name: kind for name, kind in recorded.items() if name not in found.values()}
-        for role, name in found.items():
-            if name and not fits(role, recorded[name]):
-                raise UserError(fault(role), f'{name}: {recorded[name] or "no type"}',
-                                remedy(role, free))
+        kinds = {role: recorded[name] for role, name in found.items() if name}
+        for role, kind in kinds.items():
+            if not fits(role, kind):
+                raise UserError(fault(role), f'{found[role]}: {kind or "no type"}',
+                                remedy(role, free, replaced(role, kinds)))
         if not found['image'] or not (found['odometry'] or found['command']):
             role = 'image' if not found['image'] else 'odometry or command'
             first = role.split()[0]
@@ -118,12 +119,30 @@ def proposal(role: str, recorded: Mapping[str, str]) -> str:
             'give it with --topics' if others else '')
 
 
-def remedy(role: str, recorded: Mapping[str, str]) -> str:
-    """What to do where a role has no topic, or one of another type; see `proposal`."""
+def replaced(role: str, kinds: Mapping[str, str]) -> bool:
+    """Whether odometry or commands are there in each other's place.
+
+    Args:
+        role: of `Topics`.
+        kinds: types of the topics that are there, by their roles.
+    """
+    other = {'odometry': 'command', 'command': 'odometry'}.get(role)
+    return other in kinds and fits(other, kinds[other])
+
+
+def remedy(role: str, recorded: Mapping[str, str], stand_in: bool = False) -> str:
+    """What to do where a role has no topic, or one of another type; see `proposal`.
+
+    Args:
+        role: of `Topics`.
+        recorded: types of the topics that could have it, by name.
+        stand_in: another topic is there in its place, see `replaced`.
+    """
     proposed = proposal(role, recorded)
-    if role in ('image', 'odometry', 'command'):
+    if role in ('image', 'odometry', 'command') and not stand_in:
         return proposed or (f'name the topic of the bag in a YAML file ({role}: /its/name) and '
                             'give it with --topics, or record it')
-    leave = f'`{role}: null` to leave it out'
+    leave = f'`{role}: null` to ' + ('leave it out' if role != 'odometry' else (
+        'have the commands stand in, which drift (teach needs odometry)'))
     return f'{proposed}, or {leave}' if proposed else (
-        f'write {leave} into a YAML file and give it with --topics')
+        f'in a YAML file that you give with --topics, write {leave}')

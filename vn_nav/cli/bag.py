@@ -1,4 +1,4 @@
-"""What `vn_nav bag` does: options and output."""
+"""`vn_nav bag`: check, repair, show, export and drive along recorded drives."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from vn_nav.errors import UserError
 
 
-def add_bag_commands(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     """The actions of `vn_nav bag`."""
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
@@ -139,7 +139,7 @@ def run_export(args) -> int:
 
 def run_drive(args) -> int:
     """`vn_nav bag drive`: 0; 130 after SIGINT or SIGTERM, with what was recorded until then."""
-    from vn_nav.bags.shadow.run import run
+    from vn_nav.cli.bag_drive import run
     out = args.out or Path(f'{args.bag.resolve().stem}_shadow')
     return run(args.bag, args.checkpoint, out, other=args.compare, robot=args.robot,
                topics=_topics(args.topics), goal=args.goal, decoding=args.decoding)
@@ -185,6 +185,8 @@ def _print(diagnosis) -> None:
         style = 'bold red' if finding.severity == 'error' else 'yellow'
         console.print(Text.assemble((f'{finding.severity}: ', style), f'{where} '
                                     f'{finding.what}{first}; {finding.remedy}'))
+    for note in diagnosis.notes:
+        console.print(Text(f'note: {note}'))
     if not diagnosis.findings:
         console.print(Text.assemble(('ok: ', 'green'), 'nothing is wrong with it'))
 

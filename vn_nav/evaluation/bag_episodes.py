@@ -17,7 +17,7 @@ import numpy as np
 
 from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.motion import odometry_to_array
-from vn_nav.bags.storage.reader import read_bag
+from vn_nav.bags.storage.reader import Record, read_bag
 from vn_nav.errors import UserError
 from vn_nav.evaluation.metrics import Episode
 
@@ -58,7 +58,7 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
     Raises:
         UserError: no readable bag, or one without the bridge's topics.
     """
-    records = {name: [] for name in TOPICS}
+    records: dict[str, list[Record]] = {name: [] for name in TOPICS}
     for record in read_bag(folder, TOPICS if pictures else TOPICS[:6]):
         records[record.topic].append(record)
     scenes = [(r.stamp, json.loads(r.message.data)) for r in records['scene']]
@@ -73,8 +73,10 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
         return max(0, bisect.bisect_left(order, stamp - GRACE) - 1)
 
     count = len(begins)
-    rewards, touched, ends = ([[] for _ in range(count)] for _ in range(3))
-    judged_at = [[] for _ in range(count)]
+    rewards: list[list[float]] = [[] for _ in range(count)]
+    touched: list[list[bool]] = [[] for _ in range(count)]
+    ends: list[list[int]] = [[] for _ in range(count)]
+    judged_at: list[list[int]] = [[] for _ in range(count)]
     for topic, lists in (('reward', rewards), ('collision', touched), ('episode_end', ends)):
         for record in records[topic]:
             lists[owner(record.stamp)].append(record.message.data)
@@ -86,7 +88,8 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
     def owner_by_stamp(seconds: float) -> int:
         return max(0, bisect.bisect_right(begun_at, seconds + 1e-6) - 1)
 
-    poses, posed_at = ([[] for _ in range(count)] for _ in range(2))
+    poses: list[list[np.ndarray]] = [[] for _ in range(count)]
+    posed_at: list[list[int]] = [[] for _ in range(count)]
     for record in records['ground_truth/odom']:
         values = odometry_to_array(record.message)
         poses[owner_by_stamp(values[6])].append(values[:3])

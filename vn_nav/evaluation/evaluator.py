@@ -70,7 +70,7 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
             paths[n].append(info['pose'][n, :3])
             if info['collided'][n]:
                 contacts[n].append(info['pose'][n, :2])
-        for n in np.nonzero(terminated | truncated)[0]:
+        for n in np.nonzero(terminated | truncated)[0].tolist():
             found[n].append(Episode(
                 success=bool(info['success'][n]), start_distance=float(info['start_distance'][n]),
                 path_length=float(info['path_length'][n]), decisions=int(info['decisions'][n]),
@@ -169,7 +169,8 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
         By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
         'declared': ...}; without an arrival head 'arrival' alone.
     """
-    robot, rows = robot or RobotSpec(), {}
+    robot = robot or RobotSpec()
+    rows: Rows = {}
     threshold = STOP_THRESHOLD if threshold is None else threshold
     each = -(-episodes // len(houses))
     for chunk, begin in enumerate(range(0, len(houses), HOUSES_AT_ONCE)):
@@ -183,7 +184,9 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
                 env.set_shown_goal(shown)
                 rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
                     env, actor, rounds * environments, seed=seed + chunk, robot=robot))
-            if env.config.task != 'image' or not next(iter(actors.values()))[0].knows_arrival:
+            own, _ = next(iter(actors.values()))
+            if env.config.task != 'image' or not (
+                    isinstance(own, PolicyActor) and own.knows_arrival):
                 break  # nothing to declare, or nobody to declare it
     return rows
 

@@ -58,9 +58,9 @@ def path_efficiency(episode: Episode) -> float:
 def bootstrap_interval(values: Sequence[float], *, samples: int = 2000, seed: int = 0
                        ) -> tuple[float, float]:
     """95 % interval of the mean by resampling episodes."""
-    values = np.asarray(values, float)
+    sample = np.asarray(values, float)
     rng = np.random.default_rng(seed)
-    means = values[rng.integers(len(values), size=(samples, len(values)))].mean(axis=1)
+    means = sample[rng.integers(len(sample), size=(samples, len(sample)))].mean(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)
 

@@ -115,7 +115,9 @@ def goal_pose_loss(latents: Latents, rollout: Rollout) -> Tensor:
     """
     rows = rollout.valid.numel()
     overlap = _privileged(rollout, 'overlap')[:-1].flatten()
-    return pose_loss(*(part[:rows] for part in latents.pose),
+    assert latents.pose is not None  # this task gives the network the head
+    position, heading, said = (part[:rows] for part in latents.pose)
+    return pose_loss(position, heading, said,
                      _privileged(rollout, 'goal_pose')[:-1].flatten(0, 1), overlap,
                      rollout.valid.flatten() & (overlap >= 0))
 

@@ -6,12 +6,13 @@ import hashlib
 from collections.abc import Callable
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives, draw_windows, partners, rows_of
 from vn_nav.learning.presets import TrainConfig
-from vn_nav.learning.pretrain import PretrainConfig, choose_parts
+from vn_nav.learning.pretraining import PretrainConfig, choose_parts
 from vn_nav.learning.rollout import Rollout
 from vn_nav.learning.supervised import NEEDS, Batch, Objective, Tally
 from vn_nav.policy.network import IMAGE_HEADS, Policy
@@ -99,7 +100,8 @@ class BagMix:
         if self._objective.windowed:
             windows = self._windows.take(max(count // WINDOW, 1))
         losses = self._objective.losses(Batch(rows, goals, windows), self._tally)
-        return sum(self._weight(part) * value for part, value in losses.items())
+        return sum((self._weight(part) * value for part, value in losses.items()),
+                   torch.zeros((), device=batch.action.device))
 
     def figures(self) -> dict[str, float]:
         """Mean losses since `begin_update`; see `columns`."""

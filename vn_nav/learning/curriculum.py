@@ -28,6 +28,7 @@ class Curriculum:
     def __init__(self, num_envs: int, *, start: float = 0.3, threshold: float = 0.75,
                  step: float = 0.1, window: int = 200):
         self.tau, self.threshold, self.step = start, threshold, step
+        self.window = window
         self.successes: collections.deque[bool] = collections.deque(maxlen=window)
         self._first = np.zeros(num_envs, np.int64)  # first episode that counts, by environment
         self._finished = np.zeros(num_envs, bool)
@@ -50,7 +51,7 @@ class Curriculum:
             if episode.number >= self._first[episode.env]:
                 self.successes.append(episode.success)
                 self._finished[episode.env] = True
-        if (self.tau >= 1.0 or len(self.successes) < self.successes.maxlen
+        if (self.tau >= 1.0 or len(self.successes) < self.window
                 or not self._finished.all() or self.success <= self.threshold):
             return False
         self.tau = min(1.0, round(self.tau + self.step, 6))

@@ -10,11 +10,16 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vn_nav.errors import UserError
 from vn_nav.files import write_file
 from vn_nav.learning.presets import TrainConfig
 from vn_nav.learning.state_file import written
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+    from torch.utils import tensorboard
 
 METRICS, TENSORBOARD = 'metrics.csv', 'tensorboard'
 
@@ -34,7 +39,8 @@ class Log:
 
     def __init__(self, folder: Path, config: TrainConfig, columns: Sequence[str], frames: int):
         self.config, self.columns, self.path = config, columns, folder / METRICS
-        self.writer = self.bar = None
+        self.writer: tensorboard.SummaryWriter | None = None
+        self.bar: Progress | None = None
         self.printed = -math.inf
         with written(self.path):
             if config.tensorboard:

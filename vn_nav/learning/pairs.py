@@ -21,6 +21,7 @@ from torch import Tensor
 from vn_nav.errors import UserError
 from vn_nav.learning.auxiliary import POSE_OVERLAP, image_target, pose_loss
 from vn_nav.learning.state_file import read_state, write_state
+from vn_nav.policy.encoders import Fused, Matching
 from vn_nav.policy.heads import Pose
 from vn_nav.policy.network import IMAGE_HEADS, Policy
 
@@ -81,7 +82,8 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
     optimiser = torch.optim.Adam(parameters, config.learning_rate)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / STATE
-    seconds, rows = 0.0, []
+    seconds = 0.0
+    rows: list[dict] = []
     if path.is_file():
         seconds, rows = _load(path, network, optimiser, source)
     held_out = validation.draw(1024)
@@ -144,7 +146,7 @@ def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     true_position, true_heading = truth[sees, :2], truth[sees, 2:]
     far = true_position.norm(dim=1) > 0.3  # nearer, a bearing means nothing
     bearing = _angle(position, true_position)[far]
-    correct = (pose.overlap.detach() > 0) == sees
+    correct = (pose.co_visible.detach() > 0) == sees
     return {
         'bearing_deg': _median(bearing), 'bearing_within_30': _mean(bearing <= 30),
         'heading_deg': _median(_angle(heading, true_heading)),
@@ -166,8 +168,10 @@ def look(network: Policy, views: np.ndarray, first: np.ndarray, second: np.ndarr
     """
     shown = torch.from_numpy(views)
     goals, _ = network.goal_parts(network.encode_goals(shown))
-    seen = network.encoder.see(shown, network.compute_dtype)
-    maps, features = network.encoder.meet(seen[first], goals[second], None)
+    encoder = network.encoder
+    assert isinstance(encoder, (Fused, Matching))  # those that see a picture before its goal
+    seen = encoder.see(shown, network.compute_dtype)
+    maps, features = encoder.meet(seen[first], goals[second], None)
     return network.heads['goal_pose'](features), maps
 
 

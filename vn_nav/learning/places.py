@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import softened
 from vn_nav.policy.network import Policy
-from vn_nav.policy.places import heading_cells
+from vn_nav.policy.places import PlaceClassifier, Routes, heading_cells
 
 BATCH = 128  # pictures
 LEARNING_RATE = 1e-3  # of Adam, at the start; falls to a twentieth
@@ -36,8 +36,9 @@ def spread_spots(positions: np.ndarray, count: int) -> np.ndarray:
     """[K,2] the middles of K parts that positions [N,2] fall into (k-means)."""
     cv2.setRNGSeed(SEED)
     enough = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    _, _, spots = cv2.kmeans(positions.astype(np.float32), count, None, enough, 3,
-                             cv2.KMEANS_PP_CENTERS)
+    # OpenCV's annotations do not know that it makes the labels where there are none.
+    _, _, spots = cv2.kmeans(  # type: ignore[call-overload]
+        positions.astype(np.float32), count, None, enough, 3, cv2.KMEANS_PP_CENTERS)
     return spots
 
 
@@ -61,7 +62,7 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
     Returns:
         Medians on the other pictures: `metres` and `degrees` off, and `pictures` learned from.
     """
-    places, dtype = network.places, network.compute_dtype
+    places, dtype = _places(network), network.compute_dtype
     places.spots.copy_(torch.from_numpy(spread_spots(positions, len(places.spots))))
     learned = places.see_as(network.encoder)
     for layer in learned:
@@ -76,8 +77,9 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
                 group['lr'] = LEARNING_RATE * (1 - 0.95 * share)
             pictures, poses = source.draw(BATCH)
             scores = places.scores(torch.from_numpy(pictures), dtype)
-            loss = -sum((wanted * score).sum(1).mean() for wanted, score in zip(
+            spot, heading = ((wanted * score).sum(1).mean() for wanted, score in zip(
                 _targets(places.spots, torch.from_numpy(poses)), scores, strict=True))
+            loss = -(spot + heading)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
@@ -114,7 +116,7 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
         were learned from.
     """
     here, there = recognise(network, pictures), recognise(network, goals)
-    labels, routes = torch.from_numpy(regrets), network.routes
+    labels, routes = torch.from_numpy(regrets), _routes(network)
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(routes.parameters(), LEARNING_RATE)
     begun, seen = time.monotonic(), 0
@@ -137,6 +139,16 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
     return {'regret': lost, 'ways': seen}
 
 
+def _places(network: Policy) -> PlaceClassifier:
+    assert network.places is not None  # the network was made for a place
+    return network.places
+
+
+def _routes(network: Policy) -> Routes:
+    assert network.routes is not None  # the network was made for a place
+    return network.routes
+
+
 def _share(time_share: float, seen: int, least: int) -> float:
     """How much of the learning is over."""
     return min(time_share, seen / least) if least else time_share
@@ -145,15 +157,16 @@ def _share(time_share: float, seen: int, least: int) -> float:
 @torch.no_grad()
 def recognise(network: Policy, pictures: np.ndarray) -> Tensor:
     """What the classifier says of pictures [N,3,S,S], [N,K+16]."""
-    return torch.cat([network.places(part, network.compute_dtype)
+    places = _places(network)
+    return torch.cat([places(part, network.compute_dtype)
                       for part in torch.from_numpy(pictures).split(BATCH)])
 
 
 @torch.no_grad()
 def _regret(network: Policy, here: Tensor, there: Tensor, labels: Tensor) -> float:
-    rows = torch.arange(len(here))
+    rows, routes = torch.arange(len(here)), _routes(network)
     return float(np.mean([
-        float(own[rows, network.routes(here, goal.expand(len(here), -1))[1].argmax(1)].float()
+        float(own[rows, routes(here, goal.expand(len(here), -1))[1].argmax(1)].float()
               .mean()) for goal, own in zip(there, labels, strict=True)]))
 
 
@@ -161,7 +174,7 @@ def _regret(network: Policy, here: Tensor, there: Tensor, labels: Tensor) -> flo
 def errors(network: Policy, views: Views) -> tuple[float, float]:
     """Medians of how far off the mean pose is [m], [deg]."""
     pictures, poses = views.draw(JUDGED)
-    found = network.places.pose(recognise(network, pictures)).numpy()
+    found = _places(network).pose(recognise(network, pictures)).numpy()
     off = np.hypot(*(found[:, :2] - poses[:, :2]).T)
     turned = np.abs(wrap_angle(found[:, 2] - poses[:, 2]))
     return float(np.median(off)), float(np.degrees(np.median(turned)))

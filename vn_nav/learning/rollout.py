@@ -21,7 +21,7 @@ from vn_nav.observation import Observation
 from vn_nav.policy.action_filter import make_filter
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
-from vn_nav.policy.zhu import check_scenes
+from vn_nav.policy.zhu import Siamese, check_scenes
 
 
 @dataclasses.dataclass
@@ -151,11 +151,12 @@ class Collector:
                            empty(steps + 1, real), self._empty_extras(steps + 1))
         told = {key: empty(steps + 1, rows.dtype, *rows.shape[1:])
                 for key, rows in self.told.items()}
+        driven = None if teacher is None else empty(steps, flag)
+        chosen, value = empty(steps, real), empty(steps + 1, real)
         rollout = Rollout(
             seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
             empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, told,
-            None if teacher is None else empty(steps, flag), empty(steps, real),
-            empty(steps + 1, real), None if self._filter is None else empty(
+            driven, chosen, value, None if self._filter is None else empty(
                 steps, real, len(self.network.config.actions)))
         facts = empty(steps, torch.float64, 1 + len(self._totals))
         goal_maps = self._goal_maps()
@@ -176,7 +177,7 @@ class Collector:
                               seen.last_reward[now], extras)
             output, state = self.network(row, rollout.starts[now], self.state,
                                          goal_maps(seen.goal_index[t]))
-            rollout.value[t] = output.value[0]
+            value[t] = output.value[0]
             if t == steps:
                 break  # this observation only bootstraps; the next rollout begins with it
             self.state = state
@@ -187,14 +188,14 @@ class Collector:
                 logits = logits + rollout.filter_offsets[t]
             log_probability = torch.log_softmax(logits, dim=-1)
             action = self._sample(log_probability)
-            if teacher is not None:
-                rollout.driven[t] = self.driven
+            if teacher is not None and driven is not None:
+                driven[t] = self.driven
                 action = torch.where(self.driven[:, None], told[teacher][t][:, None], action)
             rollout.action[t] = action[:, 0]
-            rollout.log_probability[t] = log_probability.gather(1, action)[:, 0]
+            chosen[t] = log_probability.gather(1, action)[:, 0]
             facts[t] = self._step(rollout, t)
         ended = rollout.terminated | rollout.truncated
-        return rollout, _episodes(ended if teacher is None else ended & ~rollout.driven, facts)
+        return rollout, _episodes(ended if driven is None else ended & ~driven, facts)
 
     def _tensor(self, rows) -> Tensor:
         """Rows of the environment, on the network's device; shared where they are there."""
@@ -220,8 +221,9 @@ class Collector:
         """Room for what only the architecture icra2017 looks at."""
         if not self.network.frozen:
             return None
-        n, features = self.env.num_envs, self.network.encoder.frozen.features
-        extras = {'features': torch.empty(steps, n, features, device=self.device)}
+        encoder, n = self.network.encoder, self.env.num_envs
+        assert isinstance(encoder, Siamese)  # which is frozen
+        extras = {'features': torch.empty(steps, n, encoder.frozen.features, device=self.device)}
         if self._scenes > 1:
             extras['scene'] = torch.empty(steps, n, dtype=torch.int64, device=self.device)
         return extras

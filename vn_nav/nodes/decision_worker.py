@@ -181,13 +181,14 @@ class DecisionWorker:
             if self._epoch != self._navigator.epoch:
                 self._epoch = self._navigator.epoch
                 self._runtime.reset()
-            if self._shadow and (self._told is None or stamp < self._told[0]):
+            told = self._told if self._shadow else None
+            if self._shadow and (told is None or stamp < told[0]):
                 return
             ticket = self._navigator.request(stamp, now)
             if ticket is None:
                 return
-            if self._shadow:
-                self._runtime.correct(self._told[1])
+            if told is not None:
+                self._runtime.correct(told[1])
                 self._told = None
         try:
             action = self._runtime.act(picture)

@@ -335,6 +335,8 @@ class PolicyNode(LifecycleNode):
                 self._warnings.append('/clock has several publishers: time will jump; keep one')
         with self._wake:
             state, reason = self.navigator.state, self.navigator.reason
+            if state is State.IDLE and not self.is_running:
+                reason = 'the node is not active'
             fov, gate = self._worker.camera_fov, self.navigator.gate
             values = {'decisions': self.navigator.decisions, **self._worker.filter_values(),
                       **self._inputs.values(),

@@ -47,7 +47,7 @@ def declare(node, names: Iterable[str] = tuple(PARAMETERS), **options) -> None:
 def check(name: str, value: object) -> None:
     """Raise a `UserError` for a value that a parameter cannot have."""
     parameters.check(name, PARAMETERS, value)
-    if name == 'stop_threshold' and -1.0 < value < 0.0:
+    if name == 'stop_threshold' and isinstance(value, float) and -1.0 < value < 0.0:
         raise UserError('stop_threshold lies in [0, 1], or is -1', value,
                         'set it with -p stop_threshold:=...')
 

@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar
 
 import rclpy
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -27,9 +28,10 @@ from vn_nav.nodes.signals import Ended
 __all__ = ['Ended', 'compiling', 'run_node', 'spin']
 
 # What ROS says of words that it refuses, while it starts or makes a node.
+_ros: Any = rclpy._rclpy_pybind11  # type: ignore[attr-defined]  # compiled, without types
 REFUSED = (NameValidationException, ParameterException,
-           rclpy._rclpy_pybind11.RCLError, rclpy._rclpy_pybind11.RCLInvalidROSArgsError,
-           rclpy._rclpy_pybind11.UnknownROSArgsError)
+           _ros.RCLError, _ros.RCLInvalidROSArgsError, _ros.UnknownROSArgsError)
+AnyNode = TypeVar('AnyNode', bound=Node)
 USAGE = """usage: ros2 run vn_nav {name} [--ros-args [-p name:=value] [--params-file file]
        [-r topic:=other] [-r __ns:=/namespace] [--log-level debug|info|warn|error|fatal]]
 
@@ -45,7 +47,8 @@ REMEDIES = {  # by the word in front of what is refused
 }
 
 
-def run_node(name: str, make: Callable[[Ended], Node], work: Callable[[Node, Ended], None],
+def run_node(name: str, make: Callable[[Ended], AnyNode],
+             work: Callable[[AnyNode, Ended], None],
              args: list[str] | None = None, *, about: str = '',
              parameters: Mapping[str, tuple] | None = None) -> int:
     """Make a node, work until a signal, destroy it. Afterwards the process has to end.

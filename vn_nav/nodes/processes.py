@@ -20,7 +20,8 @@ class Processes:
     """Children, each with a log file; all are gone at the end."""
 
     def __init__(self, logs: Path):
-        self.logs, self.running = logs, {}
+        self.logs = logs
+        self.running: dict[str, subprocess.Popen] = {}
         self.killed: list[str] = []  # children that did not end when they were asked to
         logs.mkdir(parents=True, exist_ok=True)
         self.environment = os.environ | {

@@ -21,7 +21,9 @@ from rclpy.signals import SignalHandlerOptions
 from vn_nav.bags.drive import RECORDED
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.nodes.process import Ended
-from vn_nav.nodes.ros_robot import BESIDE, RosRobot, Seen
+from vn_nav.nodes.robot_senses import BESIDE, Seen
+from vn_nav.nodes.ros_robot import RosRobot
+from vn_nav.reset_arguments import read_options
 from vn_nav.robot import RobotSpec
 
 GOALS = 1024  # different goal pictures of a training
@@ -169,7 +171,7 @@ class RosEnv:
         Raises:
             UserError: a `reset_mask`: robots begin together.
         """
-        if 'reset_mask' in (options or {}):
+        if 'reset_mask' in read_options(options, ('reset_mask',)):
             raise UserError('robots over ROS begin their episodes together', 'a reset_mask',
                             'reset without it')
         seen = [self._begin(n) for n in range(self.num_envs)]
@@ -205,8 +207,9 @@ class RosEnv:
                 self._tell(seen, reset, success, collided, arrived))
 
     def _begin(self, k: int) -> Seen:
-        seen = self._robots[k].begin()
-        self._goal_index[k] = self._number(self._robots[k].goal)
+        seen, goal = self._robots[k].begin(), self._robots[k].goal
+        assert goal is not None  # no episode begins without
+        self._goal_index[k] = self._number(goal)
         self._last_action[k], self._last_reward[k] = -1, 0.0
         return seen
 

@@ -13,6 +13,7 @@ import contextlib
 import os
 import signal
 from collections.abc import Callable, Iterator
+from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 
@@ -50,11 +51,12 @@ class Ended:
     def _on_signal(self, *_):
         self._ended = True
         if self._let_go is not None:
-            self._leave()
+            self._leave(self._let_go)
 
-    def _leave(self) -> None:
+    @staticmethod
+    def _leave(let_go: Callable[[], None]) -> NoReturn:
         try:
-            self._let_go()
+            let_go()
         finally:
             os._exit(0)
 
@@ -71,7 +73,7 @@ class Ended:
         self._let_go = let_go
         try:
             if self._ended:
-                self._leave()
+                self._leave(let_go)
             yield
         finally:
             self._let_go = None

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import reprlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from vn_nav.errors import UserError
 from vn_nav.structured_file import read_json
@@ -15,11 +16,10 @@ WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
 FORMAT = 2
 OWN = {'format', 'network', 'action_names', 'sha256'}  # keys beside those of INFO
 CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
-NUMBER = (int, float)
 DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
 # What a checkpoint says beside its weights, and what it says when nobody told it.
-INFO = {
+INFO: dict[str, Any] = {
     'world_version': REQUIRED,  # of the simulator's pixels, houses and motion
     'camera_fov_deg': REQUIRED,  # of the square picture
     'camera_height': REQUIRED,  # m above the floor
@@ -42,17 +42,27 @@ INFO = {
     'results': {},  # measured figures and controls, by name
     'notes': '',
 }
-# Their types, and the least and the greatest value of numbers. None is allowed where it is the
-# value when nobody told.
+
+
+class Rule(NamedTuple):
+    """What a value has to be."""
+
+    types: tuple[type, ...]
+    least: float = -math.inf  # of a number
+    most: float = math.inf
+
+
+TEXT, LIST, INTEGER, NUMBER = (str,), (list, tuple), (int,), (int, float)
+# None is allowed where it is the value when nobody told.
 INFO_TYPES = {
-    'world_version': (str,), 'decoding': (str,), 'task': (str,), 'randomisation': (str,),
-    'preset': (str,), 'command': (str,), 'notes': (str,), 'results': (dict,),
-    'data': (str,), 'losses': (list, tuple), 'houses': (list, tuple),
-    'rooms': (int, 1, 1000), 'objects': (int, 0, 1000),
-    'goals_per_room': (int, 1, 1000), 'goal_variants': (int, 1, 1000),
-    'stop_threshold': (NUMBER, 0, 1), 'seed': (int, -2**63, 2**64), 'frames': (int, 0, 2**63),
-    'minutes': (NUMBER, 0, 1e9), 'camera_fov_deg': (NUMBER, 1e-3, 179),
-    'camera_height': (NUMBER, 1e-3, 100),
+    'world_version': Rule(TEXT), 'decoding': Rule(TEXT), 'task': Rule(TEXT),
+    'randomisation': Rule(TEXT), 'preset': Rule(TEXT), 'command': Rule(TEXT),
+    'notes': Rule(TEXT), 'results': Rule((dict,)), 'data': Rule(TEXT), 'losses': Rule(LIST),
+    'houses': Rule(LIST), 'rooms': Rule(INTEGER, 1, 1000), 'objects': Rule(INTEGER, 0, 1000),
+    'goals_per_room': Rule(INTEGER, 1, 1000), 'goal_variants': Rule(INTEGER, 1, 1000),
+    'stop_threshold': Rule(NUMBER, 0, 1), 'seed': Rule(INTEGER, -2**63, 2**64),
+    'frames': Rule(INTEGER, 0, 2**63), 'minutes': Rule(NUMBER, 0, 1e9),
+    'camera_fov_deg': Rule(NUMBER, 1e-3, 179), 'camera_height': Rule(NUMBER, 1e-3, 100),
 }
 
 
@@ -124,16 +134,13 @@ def check_info(info: dict, where: str) -> dict:
 def _check_entry(key: str, value: object, where: str) -> None:
     """Raise a `UserError` for a value of another type than its key's, or out of its range."""
     rule = INFO_TYPES[key]
-    kinds, span = (rule[0], rule[1:]) if len(rule) == 3 else (rule, ())
-    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
-    kept = isinstance(value, kinds) and not isinstance(value, bool)
-    if kept and key == 'houses':
-        kept = all(isinstance(house, int) and not isinstance(house, bool) for house in value)
-    if kept and key == 'losses':
-        kept = all(isinstance(name, str) for name in value)
+    kept = isinstance(value, rule.types) and not isinstance(value, bool)
+    if kept and isinstance(value, LIST):
+        item = {'houses': int, 'losses': str}[key]
+        kept = all(isinstance(one, item) and not isinstance(one, bool) for one in value)
     if not kept:
-        names = ' or '.join(kind.__name__ for kind in kinds)
+        names = ' or '.join(kind.__name__ for kind in rule.types)
         raise UserError(f'{key} is {names}', reprlib.repr(value), f'correct {where}')
-    if span and not span[0] <= value <= span[1]:
-        raise UserError(f'{key} lies between {span[0]:g} and {span[1]:g}', value,
+    if isinstance(value, NUMBER) and not rule.least <= value <= rule.most:
+        raise UserError(f'{key} lies between {rule.least:g} and {rule.most:g}', value,
                         f'correct {where}')

@@ -22,13 +22,18 @@ LARGE = 128  # pixels: from here on the thesis network has its layout for 174 x 
 
 def apply(layer: nn.Conv2d | nn.Linear | nn.ConvTranspose2d, x: Tensor) -> Tensor:
     """A layer in the type of its input."""
-    weight = layer.weight.to(x.dtype)
-    bias = None if layer.bias is None else layer.bias.to(x.dtype)
+    weight, bias = layer.weight.to(x.dtype), bias_of(layer, x.dtype)
     if isinstance(layer, nn.Linear):
         return F.linear(x, weight, bias)
     if isinstance(layer, nn.ConvTranspose2d):
         return F.conv_transpose2d(x, weight, bias, layer.stride)
     return F.conv2d(x, weight, bias, layer.stride, layer.padding)
+
+
+def bias_of(layer: nn.Conv2d | nn.Linear | nn.ConvTranspose2d, dtype: torch.dtype
+            ) -> Tensor | None:
+    """A layer's bias, if it has one, in some type."""
+    return None if layer.bias is None else layer.bias.to(dtype)
 
 
 def add_goals(frames: Tensor, goals: Tensor, goal_index: Tensor | None) -> Tensor:
@@ -86,7 +91,7 @@ class Pixels(nn.Module):
         if self.mean:
             pixels = pixels.sub_(self.mean)
         weight = (self.conv.weight[:, part] / self.std).to(dtype)
-        return F.conv2d(pixels, weight, self.conv.bias.to(dtype) if bias else None,
+        return F.conv2d(pixels, weight, bias_of(self.conv, dtype) if bias else None,
                         self.conv.stride)
 
 
@@ -117,9 +122,8 @@ class Fused(nn.Module):
         self.trunk = nn.Linear(third * side**2, features)
         self.features = features
         orthogonal(self)
-        for block in (*self.stage1, *self.stage2):
-            nn.init.zeros_(block.conv2.weight)  # begins as the identity
-        self.to(memory_format=torch.channels_last)
+        identities(self)
+        channels_last(self)
 
     def encode_goals(self, goals: Tensor, dtype: torch.dtype) -> Tensor:
         """The goals' share of the first convolution, [G,C,h,w]."""
@@ -162,6 +166,19 @@ class ResidualBlock(nn.Module):
         return F.relu(x + apply(self.conv2, F.relu(apply(self.conv1, x))))
 
 
+def identities(module: nn.Module) -> None:
+    """Let the residual blocks begin as the identity."""
+    for block in module.modules():
+        if isinstance(block, ResidualBlock):
+            nn.init.zeros_(block.conv2.weight)
+
+
+def channels_last(module: nn.Module) -> None:
+    """Let the weights of convolutions lie in memory as the pictures do."""
+    # torch's own annotations of `to` lack the argument.
+    module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
 def directions(maps: Tensor) -> Tensor:
     """Maps [N,C,h,w] of length 1 along C; the lengths in float32, for bfloat16 is too coarse."""
     return F.normalize(maps.float(), dim=1).to(maps.dtype)
@@ -199,9 +216,8 @@ class Matching(nn.Module):
         self.trunk = nn.Linear(third * side**2, features)
         self.features = features
         orthogonal(self)
-        for block in self.stage:
-            nn.init.zeros_(block.conv2.weight)  # begins as the identity
-        self.to(memory_format=torch.channels_last)
+        identities(self)
+        channels_last(self)
 
     def see(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         """Maps of a picture alone, [N,C,h,w]."""
@@ -275,7 +291,7 @@ class TwoStreams(nn.Module):
                 dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Maps [N,32,9,9] and features [N,512]."""
         weight = self.fuse.weight[:, :self.stream].to(dtype)
-        x = F.conv2d(self._stream(image, dtype), weight, self.fuse.bias.to(dtype),
+        x = F.conv2d(self._stream(image, dtype), weight, bias_of(self.fuse, dtype),
                      self.fuse.stride)
         x = add_goals(x.permute(0, 2, 3, 1), goal_maps.permute(0, 2, 3, 1), goal_index)
         x = F.relu(apply(self.mix, F.relu(x).permute(0, 3, 1, 2)))

@@ -71,7 +71,8 @@ def export_onnx(checkpoint: LoadedCheckpoint, folder: str | Path) -> list[Path]:
         UserError: the package onnx is not installed, or the folder cannot be written.
     """
     step, folder = _Step(checkpoint.network), Path(folder)
-    models = {POLICY: (step, step.example, step.output_names)}
+    models: dict[str, tuple[nn.Module, dict[str, Tensor], list[str]]] = {
+        POLICY: (step, step.example, step.output_names)}
     if 'goal' in step.example:
         models[GOAL] = (_Goal(checkpoint.network), {'picture': step.example['image']}, ['goal'])
     files = {name: _export(*model, checkpoint) for name, model in models.items()}
@@ -156,7 +157,9 @@ def _export(module: nn.Module, example: dict[str, Tensor], outputs: list[str],
         # its newer exporter, which needs more packages.
         warnings.simplefilter('ignore', torch.jit.TracerWarning)
         warnings.simplefilter('ignore', DeprecationWarning)
-        torch.onnx.export(module.eval(), tuple(example.values()), buffer, dynamo=False,
+        # torch's annotations know only the new exporter, which takes no open file.
+        torch.onnx.export(module.eval(), tuple(example.values()),
+                          buffer, dynamo=False,  # type: ignore[arg-type]
                           opset_version=OPSET, input_names=list(example), output_names=outputs)
     model = onnx.load_from_string(buffer.getvalue())
     info, config = checkpoint.info, checkpoint.config

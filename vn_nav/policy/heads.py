@@ -7,7 +7,8 @@ A actions, H hidden units.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -38,6 +39,11 @@ def dueling(value: Tensor, advantage: Tensor) -> Tensor:
     return value + advantage - advantage.mean(-3, keepdim=True)
 
 
+def transposed(layers: nn.ModuleList) -> Iterable[nn.ConvTranspose2d]:
+    """The transposed convolutions in a list: torch's type does not say what is in it."""
+    return cast(Iterable[nn.ConvTranspose2d], layers)
+
+
 class PixelControl(nn.Module):
     """Action values of changing each cell of the picture (thesis, 4.3.2 and figure 4.3).
 
@@ -58,9 +64,10 @@ class PixelControl(nn.Module):
     def forward(self, hidden: Tensor) -> Tensor:
         """Q [N,A,k,k] float32 from the memory's outputs [N,H]."""
         x = F.relu(apply(self.expand, hidden)).view(-1, 32, self.side, self.side)
-        for layer in self.grow:
+        for layer in transposed(self.grow):
             x = F.relu(apply(layer, x))
         # Both branches are one deconvolution: one pass over x.
+        assert self.value.bias is not None and self.advantage.bias is not None  # as they are made
         weight = torch.cat([self.value.weight, self.advantage.weight], dim=1).to(x.dtype)
         bias = torch.cat([self.value.bias, self.advantage.bias]).to(x.dtype)
         both = F.conv_transpose2d(x, weight, bias, 2).float()
@@ -97,10 +104,11 @@ class ImageHead(nn.Module):
 
     def forward(self, maps: Tensor) -> Tensor:
         """[N,out,k,k] float32 from [N,C,h,w]."""
+        *inner, last = transposed(self.grow)
         x = maps
-        for layer in self.grow[:-1]:
+        for layer in inner:
             x = F.relu(apply(layer, x))
-        return apply(self.grow[-1], x).float()
+        return apply(last, x).float()
 
 
 class Pose(NamedTuple):
@@ -108,11 +116,11 @@ class Pose(NamedTuple):
 
     position: Tensor  # [N,2] x forward, y left [m]
     heading: Tensor  # [N,2] cos, sin of the goal's heading less the robot's
-    overlap: Tensor  # [N] logit: does the picture show some of what the goal picture shows?
+    co_visible: Tensor  # [N] logit: does the picture show some of what the goal picture shows?
 
 
 class GoalPose(nn.Module):
-    """Relative pose of the goal, and whether the two pictures overlap, from the features.
+    """Relative pose of the goal, and whether the two pictures show the same, from the features.
 
     Not in the thesis: the comparison of picture and goal is what a policy for unseen houses
     lacks, and its labels are free in a simulator or with odometry (docs/results.md).

@@ -59,7 +59,7 @@ class ActionExecutor:
             [4] vx, vy [m/s], wz, tilt rate [rad/s]; and whether the action is over (then zero).
         """
         if self._start is not None and odometry is not None:
-            self._measure(odometry)
+            self._measure(self._start, odometry)
         remaining = self._size - self._covered
         tolerance = self.tolerance * (1.0 if self._axis in ('dx', 'dy') else 2.0)
         stuck = (self._elapsed >= BLOCKED_FACTOR * self._nominal
@@ -82,16 +82,16 @@ class ActionExecutor:
         velocity[AXES.index(self._axis)] = self._sign * speed
         return velocity, False
 
-    def _measure(self, odometry: np.ndarray) -> None:
-        """Displacement along the action's axis since its start, from odometry."""
+    def _measure(self, start: np.ndarray, odometry: np.ndarray) -> None:
+        """Displacement along the action's axis since odometry said `start`."""
         if self._axis == 'dyaw':
             change = odometry[2] - self._last_yaw
             self._turned += (change + math.pi) % (2 * math.pi) - math.pi
             self._last_yaw = odometry[2]
             self._covered = self._sign * self._turned
             return
-        along = self._start[2] + (math.pi / 2 if self._axis == 'dy' else 0.0)
-        dx, dy = odometry[0] - self._start[0], odometry[1] - self._start[1]
+        along = start[2] + (math.pi / 2 if self._axis == 'dy' else 0.0)
+        dx, dy = odometry[0] - start[0], odometry[1] - start[1]
         self._covered = self._sign * (dx * math.cos(along) + dy * math.sin(along))
 
 

@@ -338,7 +338,7 @@ class Navigator:
 
     def _watch(self, now: float, odometry_lost: bool) -> None:
         """Silence of camera and odometry, and holds whose cause is gone."""
-        silence = now - self._last_frame
+        silence = np.inf if self._last_frame is None else now - self._last_frame
         if silence > self.limits.frame_stop_timeout:
             self.stop(f'no camera frame for {self.limits.frame_stop_timeout} s', now)
         elif silence > self.limits.frame_timeout:

@@ -38,6 +38,8 @@ class PlaceClassifier(nn.Module):
             the weights of checkpoints.
     """
 
+    spots: Tensor
+
     def __init__(self, size: int, spots: int, mean: float, std: float):
         super().__init__()
         self.width = spots + HEADINGS
@@ -100,6 +102,8 @@ class MultiViewAveraging(nn.Module):
     Attributes:
         width: K + 1 numbers to remember: the sum of the probabilities, and of how many pictures.
     """
+
+    stays: Tensor
 
     def __init__(self, moves: Sequence[Sequence[float]], spots: int):
         super().__init__()

@@ -27,6 +27,9 @@ UNUSED = ('fc.weight', 'fc.bias')
 class FixedNorm(nn.Module):
     """Batch normalisation by stored statistics, whether the network trains or not."""
 
+    running_mean: Tensor
+    running_var: Tensor
+
     def __init__(self, channels: int):
         super().__init__()
         self.weight = nn.Parameter(torch.ones(channels))
@@ -74,6 +77,12 @@ class ResNet50(nn.Module):
     """
 
     features = 2048
+    layer1: nn.Sequential
+    layer2: nn.Sequential
+    layer3: nn.Sequential
+    layer4: nn.Sequential
+    mean: Tensor
+    std: Tensor
 
     def __init__(self):
         super().__init__()

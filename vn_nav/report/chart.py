@@ -93,9 +93,9 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
     shapes += [Line(np.array([[left, bottom], [right, bottom]]), 'soft'),
                Text((left + right) / 2, bottom + 40, title, 'middle', 'ink', 13)]
     for s in series:
-        x = np.array([across(value) for value in s.x])
-        outline = np.concatenate([np.stack([x, up(s.high)], 1),
-                                  np.stack([x, up(s.low)], 1)[::-1]])
+        along = np.array([across(value) for value in s.x])
+        outline = np.concatenate([np.stack([along, up(s.high)], 1),
+                                  np.stack([along, up(s.low)], 1)[::-1]])
         shapes.append(Line(outline, s.colour, opacity=0.16, filled=True))
     for s in series:
         points = np.stack([[across(value) for value in s.x], up(s.mean)], 1)
@@ -179,7 +179,8 @@ def to_svg(shapes: Sequence[Shape], width: float, height: float, label: str, *,
 def to_picture(shapes: Sequence[Shape], width: float, height: float, *, zoom: float = 2.0
                ) -> np.ndarray:
     """The same as a picture, [H,W,3] uint8 RGB, in the light colours."""
-    image = np.full((round(height * zoom), round(width * zoom), 3), _rgb('card'), np.uint8)
+    image: np.ndarray = np.full(
+        (round(height * zoom), round(width * zoom), 3), _rgb('card'), np.uint8)
     for shape in shapes:
         if isinstance(shape, Text):
             size = shape.size * zoom / 30
@@ -202,7 +203,8 @@ def to_picture(shapes: Sequence[Shape], width: float, height: float, *, zoom: fl
 
 def _rgb(colour: str) -> tuple[int, int, int]:
     value = LIGHT[colour]
-    return tuple(int(value[k:k + 2], 16) for k in (1, 3, 5))
+    red, green, blue = (int(value[k:k + 2], 16) for k in (1, 3, 5))
+    return red, green, blue
 
 
 def _dashes(points: np.ndarray) -> list[np.ndarray]:

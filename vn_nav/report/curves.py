@@ -130,7 +130,7 @@ def average(runs: Sequence[Run], axis: str, metric: str, *, band: str = 'range',
     mean, spread = values.mean(axis=0), values.std(axis=0)
     low, high = ((mean - spread, mean + spread) if band == 'std'
                  else (values.min(axis=0), values.max(axis=0)))
-    return Curve(back(grid), mean, low, high, (taus >= FULL).all(axis=0))
+    return Curve(back(grid), mean, low, high, np.all(taus >= FULL, axis=0))
 
 
 def _smooth(x: np.ndarray, y: np.ndarray, grid: np.ndarray, width: float) -> np.ndarray:

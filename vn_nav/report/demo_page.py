@@ -118,6 +118,7 @@ def _chosen(episodes: list[RecordedEpisode], most: int = 4) -> list[RecordedEpis
 
 
 def _journey(recorded: RecordedEpisode) -> str:
+    assert recorded.goal_picture is not None  # see `_chosen`
     e = recorded.episode
     numbers = sorted(recorded.pictures)
     picked = np.unique(np.linspace(0, len(numbers) - 1, STRIP).round().astype(int))

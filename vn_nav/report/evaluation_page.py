@@ -134,6 +134,7 @@ def outcome(episode: Episode) -> str:
 
 
 def _map(episode: Episode, plan: dict, limit: int, bag: str | None) -> str:
+    assert episode.trajectory is not None  # of an episode that was driven here
     kind = 'yes' if episode.success else 'no'
     goals = [] if episode.goal_pose is None else [episode.goal_pose]
     drawn = floor_map(plan, [Journey(episode.trajectory, episode.success, episode.contacts)],

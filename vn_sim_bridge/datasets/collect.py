@@ -186,7 +186,7 @@ class _Bag:
     def __init__(self, writer: Writer, robot: RobotSpec, names: Sequence[str]):
         self._writer, self._robot, self._names = writer, robot, set(names)
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        self._header = None  # of the present picture
+        self._header: dict[str, Any] = {}  # of the present picture
         self._now = BEGIN_NS  # stamp of the next picture
         self.pictures = self.episodes = 0
 

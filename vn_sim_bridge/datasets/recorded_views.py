@@ -26,7 +26,8 @@ class GraphViews:
         seed: of the draws.
     """
 
-    def __init__(self, graph: ImageGraph, robot: RobotSpec, nodes: Sequence[int], seed: int = 0):
+    def __init__(self, graph: ImageGraph, robot: RobotSpec, nodes: Sequence[int] | np.ndarray,
+                 seed: int = 0):
         self._graph, self._robot, self._seed = graph, robot, seed
         self._nodes, self._count = np.asarray(nodes, np.int64), 0
 

@@ -85,7 +85,7 @@ def motion_noise(delta: np.ndarray, nominal: np.ndarray, normals: np.ndarray) ->
 
 def nominal_sizes(robot: RobotSpec) -> dict[str, float]:
     """Size of the action that a Twist along an axis and direction belongs to: '+dx', '-dx', ..."""
-    sizes = {}
+    sizes: dict[str, float] = {}
     for action in robot.actions:
         sizes.setdefault(('+' if action.size > 0 else '-') + action.axis, abs(action.size))
     return sizes

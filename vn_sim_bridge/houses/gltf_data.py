@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import math
+import re
 import struct
 from pathlib import Path
 from urllib.parse import unquote, unquote_to_bytes
@@ -53,14 +55,11 @@ class GltfData:
         self.path, self._blob = path, None
         text = read_bytes(path, 'a mesh file can be read')
         if path.suffix.lower() == '.glb':
-            text, self._blob = _chunks(text)
+            text, self._blob = _chunks(text, path)
         self.json = json.loads(text)
         if not isinstance(self.json, dict):
             raise ValueError('its JSON is no object')
-        version = str(self.json['asset']['version'])
-        if not version.startswith('2.'):
-            raise UserError('a mesh file is glTF 2.0', f'{path}: version {version}',
-                            'export it again, for instance from Blender')
+        _check_version(self.json.get('asset'), path)
         for name in self.json.get('extensionsRequired', ()):
             if name in COMPRESSED:
                 raise compressed(COMPRESSED[name], name, path)
@@ -177,6 +176,7 @@ class GltfData:
         """An image, [H,W,3] uint8."""
         if index not in self._pictures:
             entry = self.get('images', index)
+            data: bytes | memoryview
             if 'uri' in entry:
                 name, data = self._uri(entry['uri'])
             else:
@@ -186,13 +186,34 @@ class GltfData:
         return self._pictures[index]
 
 
-def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
+def _check_version(asset: object, path: Path) -> None:
+    """Refuse what is not glTF 2.0, or demands more of its reader.
+
+    A later 2.x may be read by what the reader knows, if the file does not name a higher
+    `minVersion`.
+    """
+    if not isinstance(asset, dict) or 'version' not in asset:
+        raise _other_version(path, 'no version (asset.version)')
+    for key, most in (('version', math.inf), ('minVersion', 0)):
+        version = str(asset.get(key, '2.0'))
+        found = re.fullmatch(r'([0-9]{1,9})\.([0-9]{1,9})', version)
+        if (found is None or int(found[1]) > 2 or int(found[1]) < 2 and key == 'version'
+                or int(found[1]) == 2 and int(found[2]) > most):
+            raise _other_version(path, f'asset.{key} {version[:20]!r}')
+
+
+def _other_version(path: Path, received: str) -> UserError:
+    return UserError('a mesh file is glTF 2.0', f'{path}: {received}',
+                     'export it again, for instance from Blender')
+
+
+def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
     """JSON and binary chunk of a GLB."""
     magic, version, length = struct.unpack_from('<4sII', data)
+    if magic == b'glTF' and version != 2:
+        raise _other_version(path, f'GLB version {version}')
     if magic != b'glTF' or length != len(data):
         raise ValueError(f'header says {length} bytes, the file has {len(data)}')
-    if version != 2:
-        raise ValueError(f'GLB version {version}; read is 2')
     found, at = [], 12
     while at < length:
         size, kind = struct.unpack_from('<I4s', data, at)

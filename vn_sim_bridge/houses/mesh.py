@@ -73,10 +73,18 @@ def load_mesh(path: str | Path, *, labels: dict[str, str] | None = None,
     except Exception as error:
         # Whatever a reader trips over is a broken file, not a reason for a traceback.
         raise UserError('a mesh file is whole and follows its format',
-                        f'{path}: {type(error).__name__}: {error}', 'export it again') from error
+                        f'{path}: {_words(error)}', 'export it again') from error
     if not parts:
         raise UserError('a mesh file has triangles', str(path), 'export the geometry, too')
     return _scene(parts, class_ids, path, up or 'y', scale, double_sided)
+
+
+def _words(error: Exception) -> str:
+    """What a reader tripped over, without the names of Python's exceptions."""
+    if isinstance(error, KeyError):
+        return f'{error} is missing'
+    return str(error) if isinstance(error, ValueError) else (
+        f'a value is not what the format has there ({error})')
 
 
 def _within(parts, path: Path, double_sided: bool | None) -> list[Part]:
@@ -125,7 +133,7 @@ def _scene(parts: list[Part], class_ids: list[int], path: Path, up: str, scale: 
         if part.picture is not None:
             if id(part.picture) not in numbers:
                 key = (part.picture.shape,
-                       hashlib.sha256(np.ascontiguousarray(part.picture)).digest())
+                       hashlib.sha256(np.ascontiguousarray(part.picture).data).digest())
                 if key not in known:
                     known[key] = len(images)
                     images.append(part.picture)
@@ -138,8 +146,8 @@ def _scene(parts: list[Part], class_ids: list[int], path: Path, up: str, scale: 
             pieces.append((part.corners[:, ::-1], uv[:, ::-1], part.colour, *ids))
     counts = [len(piece[0]) for piece in pieces]
     corners, uv, colour = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
-    texture, label, instance = (np.repeat([piece[k] for piece in pieces], counts)
-                                for k in range(3, 6))
+    textures, labels, instances = (np.repeat([piece[k] for piece in pieces], counts)
+                                   for k in range(3, 6))
     corners = corners * scale
     if up == 'y':
         corners = corners[..., [0, 2, 1]] * (1, -1, 1)
@@ -175,10 +183,10 @@ def _scene(parts: list[Part], class_ids: list[int], path: Path, up: str, scale: 
         face_vertices=np.arange(3 * count, dtype=np.int32),
         face_plane=np.column_stack([unit, (unit * corners[:, 0]).sum(axis=1)]).astype(np.float32),
         face_uv=face_uv.astype(np.float32),
-        face_texture=texture[order].astype(np.int32),
+        face_texture=textures[order].astype(np.int32),
         face_colour=colour[order].astype(np.float32),
-        face_label=label[order].astype(np.uint8),
-        face_instance=instance[order].astype(np.uint16),
+        face_label=labels[order].astype(np.uint8),
+        face_instance=instances[order].astype(np.uint16),
         face_light=face_light, face_light_map=light_map, light=light,
         group_start=group_start.astype(np.int32),
         group_box=boxes.astype(np.float32),

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
 
 from vn_nav.errors import UserError
+from vn_sim_bridge.houses.polygons import triangles_of
 from vn_sim_bridge.houses.surface import (
     CLAMP,
     MAX_TRIANGLES,
@@ -27,6 +29,10 @@ SURFACES = {'cstype', 'curv', 'curv2', 'surf'}  # free forms, which are no polyg
 OPTIONS = {'-s': 3, '-o': 3, '-t': 3, '-mm': 2, '-clamp': 1, '-blendu': 1, '-blendv': 1, '-cc': 1,
            '-bm': 1, '-boost': 1, '-texres': 1, '-imfchan': 1, '-type': 1, '-colorspace': 1}
 
+SWITCHES = {'-clamp', '-blendu', '-blendv', '-cc'}  # of them: on or off
+SHOWN = 60  # letters of a line that an error repeats
+MAX_INDEX = 2**31 - 1
+
 
 @dataclasses.dataclass
 class _Material:
@@ -37,51 +43,84 @@ class _Material:
     wrap: str = REPEAT
 
 
+class _Faces(NamedTuple):
+    """Polygons with absolute indices of their corners, and the lines that they stand in."""
+
+    polygons: list[list[tuple[int, int]]]
+    lines: list[int]
+
+
 def read_obj(path: Path) -> Iterator[Part]:
     """The polygons of a file, a part for each object, group and material.
 
     Raises:
-        UserError: a broken or missing file, an undefined material, a missing texture.
+        UserError: a broken line or a missing file, an undefined material, a missing texture.
         ValueError, ...: a file that does not follow the format.
     """
-    points: list[list[str]] = []
-    coordinates: list[list[str]] = []
-    faces: dict[tuple, list[list[str]]] = {}  # with absolute indices
+    points: list[list[float]] = []
+    coordinates: list[list[float]] = []
+    faces: dict[tuple, _Faces] = {}
     materials: dict[str, _Material] = {}
     libraries = 0
     place = [None, None, None]  # object, group, material
-    own = faces.setdefault(tuple(place), [])
-    for line in _lines(path):
+    own = faces.setdefault(tuple(place), _Faces([], []))
+    for number, line in _lines(path):
         word, _, rest = line.partition(' ')
-        if word == 'v':
-            points.append(rest.split())
-        elif word == 'vt':
-            coordinates.append(rest.split()[:2])
-        elif word == 'f':
-            own.append([_absolute(corner, len(points), len(coordinates))
-                        for corner in rest.split()])
-        elif word in ('o', 'g', 'usemtl'):
-            place['o g usemtl'.split().index(word)] = rest.strip()
-            own = faces.setdefault(tuple(place), [])
-        elif word == 'mtllib':
-            for library in _libraries(path, rest.strip()):
-                libraries += 1
-                materials.update(_materials(path, library))
-        elif word in SURFACES:
-            raise UserError('an OBJ file has polygons', f'{path}: {word}',
-                            'convert its free-form surfaces to a mesh')
-    shape = {len(words) for words in points}
-    vertices = np.array([words[:3] for words in points], float).reshape(-1, 3)
+        try:
+            if word == 'v':
+                points.append(_numbers(rest, 3))
+            elif word == 'vt':
+                coordinates.append((_numbers(rest, 1) + [0.0])[:2])
+            elif word == 'f':
+                corners = [_absolute(corner, len(points), len(coordinates))
+                           for corner in rest.split()]
+                if len(corners) < 3:
+                    raise ValueError('a face has three corners at least')
+                own.polygons.append(corners)
+                own.lines.append(number)
+            elif word in ('o', 'g', 'usemtl'):
+                place['o g usemtl'.split().index(word)] = rest.strip()
+                own = faces.setdefault(tuple(place), _Faces([], []))
+            elif word == 'mtllib':
+                for library in _libraries(path, rest.strip(), f'{path}, line {number}: '):
+                    libraries += 1
+                    materials.update(_materials(path, library))
+            elif word in SURFACES:
+                raise UserError('an OBJ file has polygons', f'{path}, line {number}: {word}',
+                                'convert its free-form surfaces to a mesh')
+        except (ValueError, OverflowError) as error:
+            raise _broken(path, number, line, error) from error
+    vertices = np.array([row[:3] for row in points], float).reshape(-1, 3)
     tints = None
-    if shape and min(shape) >= 6:
-        tints = np.array([words[3:6] for words in points], float)
+    if points and min(map(len, points)) >= 6:
+        tints = np.array([row[3:6] for row in points], float)
+        if not np.isfinite(tints).all():
+            raise UserError('the colours of vertices are finite', str(path), 'export it again')
         tints = np.clip(tints / 255 if tints.max() > 1 else tints, 0, 1)
-    uv = np.array([(*words, '0')[:2] for words in coordinates], float).reshape(-1, 2)
-    for names, polygons in faces.items():
-        if not polygons:
+    uv = np.array(coordinates, float).reshape(-1, 2)
+    for names, drawn in faces.items():
+        if not drawn.polygons:
             continue
         material = _named(path, names[2], materials, libraries)
-        yield _part(path, names, polygons, vertices, uv, tints, material)
+        yield _part(path, names, drawn, vertices, uv, tints, material)
+
+
+def _broken(path: Path, number: int, line: str, fault: object) -> UserError:
+    """The error for a line that is not what its first word says."""
+    return UserError('a line of an OBJ or MTL file is as its format says',
+                     f'{path}, line {number}: {line[:SHOWN]}: {fault}', 'export it again')
+
+
+def _numbers(text: str, least: int) -> list[float]:
+    """The numbers of a line, so many at least.
+
+    Raises:
+        ValueError: there are fewer, or others.
+    """
+    words = text.split()
+    if len(words) < least:
+        raise ValueError(f'{len(words)} numbers, where there are {least} at least')
+    return [float(word) for word in words]
 
 
 def _text(path: Path) -> str:
@@ -93,30 +132,40 @@ def _text(path: Path) -> str:
         return data.decode('latin-1')
 
 
-def _lines(path: Path) -> Iterator[str]:
-    """Lines with their first word in front of one space; comments and continuations undone."""
-    before = ''
-    for line in _text(path).replace('\r\n', '\n').replace('\r', '\n').split('\n'):
-        if line.endswith('\\'):
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines and their numbers, counted from 1; comments and continuations undone.
+
+    The first word of a line stands in front of one space.
+    """
+    before, first = '', 0
+    lines = _text(path).replace('\r\n', '\n').replace('\r', '\n').split('\n')
+    for number, line in enumerate(lines, 1):
+        first = first or number
+        if line.endswith('\\') and number < len(lines):
             before += line[:-1] + ' '
             continue
         words = (before + line).split(None, 1)
-        before = ''
         if words and not words[0].startswith('#'):
-            yield ' '.join(words)
+            yield first, ' '.join(words)
+        before, first = '', 0
 
 
 def _absolute(corner: str, points: int, coordinates: int) -> tuple[int, int]:
-    """Indices of vertex and texture coordinate (-1: none) of a word such as 3/1/2 or -1//-1."""
+    """Indices of vertex and texture coordinate (-1: none) of a word such as 3/1/2 or -1//-1.
+
+    Raises:
+        ValueError: no such word; an index of 0, or from the end and beyond the beginning.
+    """
     first, _, rest = corner.partition('/')
     second = rest.partition('/')[0]
-    vertex = int(first)
-    vertex = vertex - 1 if vertex > 0 else points + vertex
-    if not second:
-        return vertex, -1
-    texture = int(second)
-    texture = texture - 1 if texture > 0 else coordinates + texture
-    return vertex, texture if texture >= 0 else coordinates  # out of range stays so
+    return _index(first, points), _index(second, coordinates) if second else -1
+
+
+def _index(word: str, count: int) -> int:
+    number = int(word)
+    if not -count <= number <= MAX_INDEX or number == 0:
+        raise ValueError(f'the index {number} of {count} so far')
+    return number - 1 if number > 0 else count + number
 
 
 def _names(text: str) -> list[str]:
@@ -127,58 +176,79 @@ def _names(text: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _libraries(path: Path, text: str) -> list[Path]:
+def _libraries(path: Path, text: str, where: str) -> list[Path]:
     """The files of an mtllib line: one name, with or without spaces, or several."""
+    if not text:
+        raise ValueError('it names no file')
     words = text.split()
     if len(words) > 1 and not any((path.parent / name).is_file() for name in _names(text)) and (
             any((path.parent / name).is_file() for word in words for name in _names(word))):
-        return [find_file(path, path.parent, _names(word)) for word in words]
-    return [find_file(path, path.parent, _names(text))]
+        return [find_file(path, path.parent, _names(word), where) for word in words]
+    return [find_file(path, path.parent, _names(text), where)]
 
 
 def _materials(mesh: Path, library: Path) -> dict[str, _Material]:
     """What an MTL file defines."""
     found: dict[str, _Material] = {}
     own = None
-    for line in _lines(library):
+    for number, line in _lines(library):
         word, _, rest = line.partition(' ')
-        if word == 'newmtl':
-            own = found[rest.strip()] = _Material(np.ones(3))
-        elif word.lower() == 'kd' and own is not None:
-            values = rest.split()
-            if values[0] in ('spectral', 'xyz'):
-                raise UserError('Kd is red, green, blue', f'{library}: {line}',
-                                'export the material again')
-            own.colour = np.clip(np.array((values * 3)[:3] if len(values) == 1 else values[:3],
-                                          float), 0, 1)
-        elif word.lower() == 'map_kd' and own is not None:
-            _texture(mesh, library, rest.strip(), own)
+        word = word.lower()
+        try:
+            if word == 'newmtl':
+                if not rest.strip():
+                    raise ValueError('it has no name')
+                own = found[rest.strip()] = _Material(np.ones(3))
+            elif word in ('kd', 'map_kd') and own is None:
+                raise ValueError('no newmtl stands before it')
+            elif word == 'kd':
+                own.colour = _colour(rest)
+            elif word == 'map_kd':
+                _texture(mesh, library, rest.strip(), own, f'{library}, line {number}: ')
+        except ValueError as error:
+            raise _broken(library, number, line, error) from error
     return found
 
 
-def _texture(mesh: Path, library: Path, text: str, material: _Material) -> None:
+def _colour(text: str) -> np.ndarray:
+    """The display values [3] of a Kd line: red, green and blue, or one for all."""
+    if text.split()[:1] in (['spectral'], ['xyz']):
+        raise ValueError('Kd is red, green, blue')
+    values = _numbers(text, 1)
+    if len(values) == 2 or not np.isfinite(values[:3]).all():
+        raise ValueError('a colour is one number or three')
+    return np.clip((values * 3)[:3] if len(values) == 1 else values[:3], 0.0, 1.0)
+
+
+def _texture(mesh: Path, library: Path, text: str, material: _Material, where: str) -> None:
     """Read the options and the file of a map_Kd line."""
-    while (option := text.split(None, 1)[0].lower()) in OPTIONS:
-        text = text.split(None, 1)[1]
+    while (option := text.partition(' ')[0].lower()) in OPTIONS:
+        words = text.split()[1:]
         values: list[str] = []
-        while len(values) < OPTIONS[option] and len(text.split(None, 1)) == 2:
-            word, rest = text.split(None, 1)
+        for word in words[:min(OPTIONS[option], len(words) - 1)]:  # the last one is the file's
             if OPTIONS[option] > 1 and not _is_number(word):
                 break
             values.append(word)
-            text = rest
+        for _ in (option, *values):
+            text = (text.split(None, 1) + [''])[1]
+        if not values:
+            raise ValueError(f'{option} has no value, or no file behind it')
+        if option in SWITCHES and values[0].lower() not in ('on', 'off'):
+            raise ValueError(f'{option} is on or off')
         if option == '-s':
             material.scale = _pair(values, 1.0)
         elif option == '-o':
             material.offset = _pair(values, 0.0)
-        elif option == '-clamp' and values == ['on']:
+        elif option == '-clamp' and values[0].lower() == 'on':
             material.wrap = CLAMP
         elif (option == '-mm' and [float(v) for v in values] != [0.0, 1.0]) or (
                 option == '-t' and any(float(v) for v in values)):
             raise UserError('a texture is drawn as its picture shows it',
-                            f'{library}: map_Kd {option} {" ".join(values)}',
+                            f'{where}map_Kd {option} {" ".join(values)}',
                             'change the picture instead')
-    file = find_file(mesh, library.parent, _names(text))
+    if not text:
+        raise ValueError('it names no file')
+    file = find_file(mesh, library.parent, _names(text), where)
     material.picture = decode_picture(file, read_bytes(file, 'a texture can be read'))
 
 
@@ -192,7 +262,10 @@ def _is_number(word: str) -> bool:
 
 def _pair(values: list[str], default: float) -> np.ndarray:
     """The first two of up to three numbers, along u and v."""
-    return np.array([float(v) for v in values[:2]] + [default] * (2 - len(values[:2])))
+    found = np.array([float(v) for v in values[:2]] + [default] * (2 - len(values[:2])))
+    if not np.isfinite(found).all():
+        raise ValueError('its numbers are finite')
+    return found
 
 
 def _named(path: Path, name: str | None, materials: dict, libraries: int) -> _Material:
@@ -205,21 +278,23 @@ def _named(path: Path, name: str | None, materials: dict, libraries: int) -> _Ma
     return _Material(np.ones(3))
 
 
-def _part(path: Path, names: tuple, polygons: list, vertices: np.ndarray, uv: np.ndarray, tints,
+def _part(path: Path, names: tuple, faces: _Faces, vertices: np.ndarray, uv: np.ndarray, tints,
           material: _Material) -> Part:
     where = f'{path}: {names[0] or names[1] or names[2] or "a face"}'
-    corners = [corner for polygon in polygons for corner in polygon]
+    corners = [corner for polygon in faces.polygons for corner in polygon]
     index = np.array(corners, np.int64).reshape(-1, 2)
-    sizes = np.array([len(polygon) for polygon in polygons])
-    if sizes.min() < 3 or index[:, 0].min() < 0 or index[:, 0].max() >= len(vertices) or (
-            index[:, 1].max() >= len(uv)):
-        raise UserError('the faces of a mesh refer to its vertices, three at least', where,
-                        'repair the mesh')
+    sizes = np.array([len(polygon) for polygon in faces.polygons])
+    beyond = (index >= (len(vertices), len(uv))).any(axis=1)
+    if beyond.any():  # only now it is known how many there are
+        row = int(np.searchsorted(np.cumsum(sizes), np.argmax(beyond), side='right'))
+        raise UserError('the faces of a mesh refer to its vertices',
+                        f'{path}, line {faces.lines[row]}: one of {len(vertices)} vertices and '
+                        f'{len(uv)} texture coordinates that is not there', 'repair the mesh')
     if (sizes - 2).sum() > MAX_TRIANGLES:
         raise UserError(f'a mesh has at most {MAX_TRIANGLES} triangles', where, 'decimate it')
     if not np.isfinite(vertices[index[:, 0]]).all():
         raise UserError('the vertices of a mesh are finite', where, 'repair the mesh')
-    picked = _triangles(sizes, vertices[index[:, 0]])
+    picked = triangles_of(sizes, vertices[index[:, 0]])
     chosen = index[picked]  # [T,3,2]
     colour = np.broadcast_to(material.colour, (len(picked), 3))
     if tints is not None:
@@ -235,55 +310,3 @@ def _part(path: Path, names: tuple, polygons: list, vertices: np.ndarray, uv: np
         own[..., 1] = 1.0 - own[..., 1]  # v points up in OBJ
         picture, own = unwrap(material.picture, own, (material.wrap,) * 2, where)
     return Part(names, vertices[chosen[..., 0]], own, colour, picture, True)
-
-
-def _triangles(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Triangles [T,3] of polygons, as indices into their corners [sum of sizes,3], in order."""
-    starts = np.cumsum(sizes) - sizes
-    found = []
-    for size in np.unique(sizes):
-        first = starts[sizes == size]
-        fans = np.array([(0, k, k + 1) for k in range(1, size - 1)])
-        triangles = first[:, None, None] + fans
-        if size > 3:
-            own = points[first[:, None] + np.arange(size)]
-            for row in np.nonzero(~_convex(own))[0]:
-                triangles[row] = first[row] + _ears(own[row])
-        found.append(triangles.reshape(-1, 3))
-    return np.concatenate(found)
-
-
-def _convex(polygons: np.ndarray) -> np.ndarray:
-    """Which polygons [P,n,3] turn one way only, [P] bool."""
-    edges = np.roll(polygons, -1, axis=1) - polygons
-    normal = np.cross(polygons, np.roll(polygons, -1, axis=1)).sum(axis=1)
-    turns = (np.cross(edges, np.roll(edges, -1, axis=1)) * normal[:, None]).sum(axis=2)
-    return (turns >= -1e-12 * np.abs(turns).max(axis=1, keepdims=True)).all(axis=1)
-
-
-def _ears(polygon: np.ndarray) -> np.ndarray:
-    """Triangles [n-2,3] of a polygon [n,3] that is not convex, by cutting off ears."""
-    normal = np.cross(polygon, np.roll(polygon, -1, axis=0)).sum(axis=0)
-    keep = np.argsort(np.abs(normal))[:2]  # seen along the largest axis
-    flat = polygon[:, keep]
-
-    def area(a, b, c) -> float:
-        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-
-    ring = list(range(len(polygon)))
-    total = sum(area(flat[0], flat[k], flat[k + 1]) for k in ring[1:-1])
-    sign = 1.0 if total >= 0 else -1.0
-    found = []
-    while len(ring) > 3:
-        for k in range(len(ring)):
-            a, b, c = ring[k - 1], ring[k], ring[(k + 1) % len(ring)]
-            if sign * area(flat[a], flat[b], flat[c]) > 0 and not any(
-                    min(sign * area(flat[p], flat[q], flat[other])
-                        for p, q in ((a, b), (b, c), (c, a))) >= 0
-                    for other in ring if other not in (a, b, c)):
-                break
-        else:
-            k = 1  # it crosses itself: any cut is as good
-        found.append((ring[k - 1], ring[k], ring[(k + 1) % len(ring)]))
-        del ring[k]
-    return np.array([*found, ring])

@@ -135,8 +135,8 @@ class Piece:
                 x = x0 + (x1 - x0 - t) * k / 4
                 self.box(x, x + t * 0.8, y0, y1, z0, z1 - 0.05, label, texture, colour, back=True)
         elif form == 'ladder':
-            for k in (0.15, 0.5, 0.85):
-                z = z0 + (z1 - z0) * k
+            for share in (0.15, 0.5, 0.85):
+                z = z0 + (z1 - z0) * share
                 self.box(x0 + t, x1 - t, y0, y1, z - 0.04, z + 0.04, label, texture, colour,
                          back=True)
         self.box(x0, x1, y0, y1, z1 - 0.07, z1, label, texture, colour, back=True, bottom=True)

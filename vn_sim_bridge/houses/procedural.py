@@ -139,7 +139,8 @@ class _Construction:
                 other = kinds.index(kind)
                 kinds[other], kinds[place] = kinds[place], kinds[other]
         half = WALL / 2
-        rooms, seen = [], {}
+        rooms: list[Room] = []
+        seen: dict[str, int] = {}
         for kind, cell in zip(kinds, self.cells, strict=True):
             seen[kind] = seen.get(kind, 0) + 1
             name = kind.replace('_', ' ') + (f' {seen[kind]}' if seen[kind] > 1 else '')
@@ -161,7 +162,8 @@ class _Construction:
 
     def _openings(self, index: int) -> dict[str, list[tuple[float, float]]]:
         """Door openings of a room by wall: 'south', 'north', 'west', 'east'."""
-        found = {'south': [], 'north': [], 'west': [], 'east': []}
+        found: dict[str, list[tuple[float, float]]] = {
+            'south': [], 'north': [], 'west': [], 'east': []}
         for door in self.doors:
             if index == door.first:
                 found['north' if door.axis == 0 else 'east'].append((door.low, door.high))
@@ -191,9 +193,9 @@ class _Construction:
         # Each wall from its left to its right end, seen from inside the room.
         ends = {'south': ((x1, y0), (x0, y0)), 'north': ((x0, y1), (x1, y1)),
                 'west': ((x0, y0), (x0, y1)), 'east': ((x1, y1), (x1, y0))}
-        for wall, (start, end) in ends.items():
+        for wall, corners in ends.items():
             instance = self._next_instance()
-            start, end = np.array(start), np.array(end)
+            start, end = map(np.array, corners)
             axis = 0 if wall in ('south', 'north') else 1
             backwards = end[axis] < start[axis]
             cuts = [start[axis]]
@@ -217,7 +219,7 @@ class _Construction:
         def place(along, across, z):
             return (along, door.at + across, z) if door.axis == 0 else (door.at + across, along, z)
 
-        quads = {
+        quads: dict[str, list[tuple[float, float, float]]] = {
             'floor': [(door.low, -half, 0), (door.high, -half, 0), (door.high, half, 0),
                       (door.low, half, 0)],
             'lintel': [(door.low, half, DOOR_HEIGHT), (door.high, half, DOOR_HEIGHT),
@@ -343,7 +345,8 @@ class _Construction:
 
     def _inner_stretches(self, index: int) -> dict[str, list[tuple[float, float]]]:
         """Parts of a room's walls with another room behind them, by wall."""
-        found = {'south': [], 'north': [], 'west': [], 'east': []}
+        found: dict[str, list[tuple[float, float]]] = {
+            'south': [], 'north': [], 'west': [], 'east': []}
         for contact in contacts(self.cells):
             if index == contact.first:
                 found['north' if contact.axis == 0 else 'east'].append((contact.low, contact.high))

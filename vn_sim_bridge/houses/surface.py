@@ -63,8 +63,14 @@ def read_bytes(path: Path, rule: str) -> bytes:
         raise UserError(rule, f'{path}: {error}', 'check its permissions') from error
 
 
-def find_file(mesh: Path, folder: Path, names: list[str]) -> Path:
+def find_file(mesh: Path, folder: Path, names: list[str], where: str = '') -> Path:
     """The first of a referred file's possible names (spaces, %20, backslashes) that exists.
+
+    Args:
+        mesh: what is read.
+        folder: in which the names are looked for.
+        names: with the one of the error first.
+        where: file and line for the error.
 
     Raises:
         UserError: none does.
@@ -72,7 +78,7 @@ def find_file(mesh: Path, folder: Path, names: list[str]) -> Path:
     for name in names:
         if name and (folder / name).is_file():
             return folder / name
-    raise UserError(f'every file that {mesh} refers to exists', names[0],
+    raise UserError(f'every file that {mesh} refers to exists', where + names[0],
                     'copy it beside the mesh, or export the mesh with embedded textures')
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import numbers
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gymnasium
 import numpy as np
@@ -14,8 +13,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from vn_nav.co_visibility import GRID, lift, overlap, relative_pose
+from vn_nav.co_visibility import GRID, co_visible, lift, relative_pose
 from vn_nav.errors import UserError
+from vn_nav.reset_arguments import are_several, read_options, read_seed, read_seeds
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.floor.contacts import motion_noise
@@ -116,10 +116,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     `config.privileged` adds to `info`, beside pictures and the shortest path's action:
     `goal_pose` [N,4] float32, the true goal's camera as the robot sees it (see
-    `overlap.relative_pose`), and `overlap` [N] float32, the share of what the true goal's picture
-    shows that the robot's picture shows too (see `overlap.overlap`; 0 for a blank goal). Without a
-    view to go to both are zeros. `explorer_action` [N] int64 is what a robot would do that knows
-    only what it has seen (see `explorer`).
+    `co_visibility.relative_pose`), and `overlap` [N] float32, the share of what the true goal's
+    picture shows that the robot's picture shows too (see `co_visibility.co_visible`; 0 for a blank
+    goal). Without a view to go to both are zeros. `explorer_action` [N] int64 is what a robot
+    would do that knows only what it has seen (see `explorer`).
 
     Args:
         config: what to simulate.
@@ -357,9 +357,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             options: `reset_mask`, [N] bool: which environments begin; the others stay as they are.
 
         Raises:
-            UserError: another number of seeds, or another mask.
+            UserError: another number of seeds, or another mask, or an option that is none.
         """
-        mask = self._reset_mask(options)
+        mask = self._reset_mask(read_options(options, ('reset_mask',)))
         if seed is not None:
             self._take_seeds(seed, mask)
         self._begin(np.nonzero(mask)[0])
@@ -367,11 +367,14 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         none = np.zeros(self.num_envs, bool)
         return self._result(self._look(), reset=mask, success=none, collided=none)
 
-    def _reset_mask(self, options: dict | None) -> np.ndarray:
+    def _reset_mask(self, options: Mapping) -> np.ndarray:
         """Which environments begin a new episode, [N] bool."""
-        if 'reset_mask' not in (options or {}):
+        if 'reset_mask' not in options:
             return np.ones(self.num_envs, bool)
-        mask = np.asarray(options['reset_mask'])
+        try:
+            mask = np.asarray(options['reset_mask'])
+        except ValueError:  # rows of several lengths
+            mask = np.zeros(0, bool)
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise UserError(f'a reset_mask is {self.num_envs} booleans, one of them true',
                             options['reset_mask'], 'pass such an array')
@@ -382,16 +385,11 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     def _take_seeds(self, seed: int | Sequence[int | None], mask: np.ndarray) -> None:
         """Give seeds to the environments of the mask [N]."""
-        everyone = np.arange(self.num_envs)
-        if np.ndim(seed) == 0:
-            given, own = [seed] * self.num_envs, everyone
+        own = np.arange(self.num_envs)
+        if are_several(seed):
+            given, own = read_seeds(seed, self.num_envs), np.zeros_like(own)
         else:
-            given, own = list(seed), np.zeros_like(everyone)
-        if len(given) != self.num_envs or not all(
-                one is None or (isinstance(one, numbers.Integral) and 0 <= one < 1 << 63)
-                for one in given):
-            raise UserError(f'a seed is a whole number that is not negative, or {self.num_envs} '
-                            'of them', seed, 'pass such seeds')
+            given = [read_seed(seed)] * self.num_envs
         for n in np.nonzero(mask)[0]:
             if given[n] is not None:
                 self._seeds[n], self._numbers[n] = given[n], own[n]
@@ -597,7 +595,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             return np.where(self._shown_goal == self.blank_goal, np.float32(0), shown)
         # The grey picture has no points.
         picture = np.where(self._shown_goal == self.blank_goal, self.blank_goal, self._picture)
-        return overlap(self._goal_points[picture], depth, *self.backend.cameras())
+        return co_visible(self._goal_points[picture], depth, *self.backend.cameras())
 
     def oracle_actions(self) -> np.ndarray:
         """The next action [N] on a shortest path to the goal, from the simulator's geometry.
@@ -655,7 +653,13 @@ class HouseNavigation(gymnasium.Env):
         self._image = np.zeros((3, size, size), np.uint8)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Begin an episode; without a seed the next one of the sequence."""
+        """Begin an episode; without a seed the next one of the sequence.
+
+        Raises:
+            UserError: a seed that is none, or options, which it does not have.
+        """
+        seed = read_seed(seed)
+        read_options(options)
         super().reset(seed=seed)
         observation, info = self._batch.reset(seed=seed)
         return self._single(observation), {key: value[0] for key, value in info.items()}

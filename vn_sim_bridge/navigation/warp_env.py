@@ -15,6 +15,7 @@ import warp as wp
 
 from vn_nav.co_visibility import GRID, SLACK, TOLERANCE, lift
 from vn_nav.errors import UserError
+from vn_nav.reset_arguments import are_several, read_options, read_seed
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.floor.contacts import (
@@ -100,7 +101,7 @@ class Robots:
     start_distance: wp.array(dtype=wp.float64)
     heading_error: wp.array(dtype=wp.float64)
     arrived: wp.array(dtype=wp.bool)
-    goal_pose: wp.array2d(dtype=wp.float32)  # as `overlap.relative_pose`
+    goal_pose: wp.array2d(dtype=wp.float32)  # as `co_visibility.relative_pose`
     path_length: wp.array(dtype=wp.float64)
     last_action: wp.array(dtype=wp.int64)
     last_reward: wp.array(dtype=wp.float32)
@@ -366,7 +367,7 @@ def begin(houses: Houses, robots: Robots, rules: Rules, n: int):
 
 @wp.func
 def compare(houses: Houses, robots: Robots, n: int):
-    """Where the goal is from here: `tasks.arrived` and `overlap.relative_pose`."""
+    """Where the goal is from here: `tasks.arrived` and `co_visibility.relative_pose`."""
     goal = wp.int32(robots.goal[n])
     yaw = robots.pose[n, 2]
     turn = houses.goal_pose[goal, 2] - yaw
@@ -486,7 +487,7 @@ def decide(houses: Houses, robots: Robots, rules: Rules, deltas: wp.array2d(dtyp
 def share_in_view(points: wp.array3d(dtype=wp.float32), picture: wp.array(dtype=wp.int64),
                   depth: wp.array3d(dtype=wp.float32), camera: wp.array2d(dtype=wp.float64),
                   focal: wp.array(dtype=wp.float64), share: wp.array(dtype=wp.float32)):
-    """As `overlap.overlap`, of the points of each robot's goal picture."""
+    """As `co_visibility.co_visible`, of the points of each robot's goal picture."""
     n = wp.tid()
     goal, size = wp.int32(picture[n]), depth.shape[1]
     frame = camera_frame(camera, n)
@@ -693,11 +694,12 @@ class WarpNavigationEnv:
         Raises:
             UserError: a list of seeds, or a `reset_mask`, which `NavigationEnv` knows.
         """
-        if 'reset_mask' in (options or {}) or not (seed is None or np.ndim(seed) == 0):
+        if 'reset_mask' in read_options(options, ('reset_mask',)) or are_several(seed):
             raise UserError('on a GPU all environments begin together, by one seed',
                             seed if options is None else options, 'use NavigationEnv')
+        seed = read_seed(seed)
         if seed is not None:
-            self._rules.seed = int(seed)
+            self._rules.seed = seed
             self._robots.episode.fill_(-1)
         wp.launch(restart, self.num_envs, [self._houses, self._robots, self._rules],
                   device=self.device)

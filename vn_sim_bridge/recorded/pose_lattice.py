@@ -65,7 +65,8 @@ class PoseMap:
         low = np.minimum(poses[:, :2].min(0), ways.reshape(-1, 2).min(0, initial=np.inf))
         high = np.maximum(poses[:, :2].max(0), ways.reshape(-1, 2).max(0, initial=-np.inf))
         room = margin + BORDER * CELL
-        self.origin = tuple(np.floor((low - room) / CELL) * CELL)
+        x, y = np.floor((low - room) / CELL) * CELL
+        self.origin = (x, y)
         columns, rows = (np.ceil((high + room - self.origin) / CELL).astype(int)).tolist()
         beside = np.zeros((rows, columns), bool)
         # A picture without a way to it is a place of its own.
@@ -74,7 +75,7 @@ class PoseMap:
         is_open = np.zeros((rows, columns, HEADINGS), bool)
         _mark_poses(np.ascontiguousarray(poses, float), beside, *self.origin, is_open)
         _fill_gaps(is_open)
-        self.floor = FloorMap(self.origin, main_component(is_open.any(axis=2)))
+        self.floor = FloorMap(self.origin, main_component(np.any(is_open, axis=2)))
         is_open &= self.floor.free[:, :, None]
         state = np.full(is_open.shape, -1, np.int32)
         state[is_open] = np.arange(np.count_nonzero(is_open))

@@ -93,7 +93,9 @@ class Rasterizer:
         focal = np.broadcast_to(size / 2 / np.tan(np.asarray(fov, float) / 2), (count,))
         kernel = _render_parallel if self.threads > 1 else _render_serial
         before = numba.get_num_threads()
-        threads = min(self.threads, numba.config.NUMBA_NUM_THREADS)
+        # Numba fills its configuration when it is imported.
+        most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        threads = min(self.threads, most)
         numba.set_num_threads(threads)
         kernel(self.pack, np.ascontiguousarray(scene_index, np.int64),
                np.ascontiguousarray(cameras, np.float64), np.ascontiguousarray(focal),

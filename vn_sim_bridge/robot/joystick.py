@@ -100,6 +100,7 @@ class Joystick:
     def _drive(self, x: float, y: float, yaw: float) -> np.ndarray:
         if self._way is None:
             self._set_out(x, y)
+        assert self._way is not None  # it has set out
         self._way = self._way[int(np.argmin(np.hypot(*(self._way[:30] - (x, y)).T))):]
         left = math.hypot(*(self._way[0] - (x, y))) + CELL * (len(self._way) - 1)
         if left < (THERE if self._turns else PASSED):
@@ -159,6 +160,7 @@ class Joystick:
 
     def _ahead(self, x: float, y: float) -> np.ndarray:
         """The farthest point of the way, up to `LOOKAHEAD`, that a straight line leads to."""
+        assert self._way is not None  # it drives along one
         choice = self._way[0]
         for point in self._way[1:round(LOOKAHEAD / CELL) + 1]:
             line = np.linspace((x, y), point, 6)[1:]
@@ -195,7 +197,8 @@ def cover(house: House, gap: np.ndarray, spacing: float) -> tuple[np.ndarray, li
     fields = [house.geodesic(x, y) for x, y in candidates]
     near = np.array([field.distance(cells) <= radius for field in fields])
     least = LEFT_OVER * math.pi * radius**2 / CELL**2
-    open_floor, picked = np.ones(len(cells), bool), []
+    open_floor = np.ones(len(cells), bool)
+    picked: list[int] = []
     while True:
         gain = (near & open_floor).sum(axis=1)
         best = int(np.argmax(gain))

@@ -23,7 +23,7 @@ HEADING_BY_TURN, HEADING_BY_WAY = 1e-5, 5e-5
 WAY_BY_WAY, WAY_BY_TURN = 4e-4, 2e-5
 
 
-def drift_errors(motion: Sequence[float], drift: float, normals: Sequence[float]
+def drift_errors(motion: Sequence[float], drift: float, normals: Sequence[float] | np.ndarray
                  ) -> tuple[float, float, float]:
     """By how much a motion is measured wrongly.
 

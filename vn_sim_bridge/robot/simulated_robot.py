@@ -167,6 +167,7 @@ class SimulatedRobot:
 
     def goal_frames(self) -> Frames:
         """The goal picture (and its depth and labels), in a light of its own."""
+        assert self.episode is not None  # a robot that is driven freely has no goal
         index, goal = self.episode.index, self.episode.goal
         variants = self.randomisation.pictures_per_goal
         variant = (index if goal < 0 else

@@ -25,7 +25,7 @@ from vn_nav.bags.doctor.figures import (
     Motion,
     Neighbours,
 )
-from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy
+from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy, replaced
 from vn_nav.bags.stamped import GAP, WINDOW
 from vn_nav.bags.storage.decoding import Decoder, Ros1
 from vn_nav.bags.storage.stream import UNLISTED, Bag, BagError, Connection, Message
@@ -274,11 +274,13 @@ class _Doctor:
     def _missing(self, roles: dict[str, list[HeardTopic]]) -> None:
         free = {t.connection.topic: t.connection.type for t in self.topics.values()
                 if t.role is None}
-        for topic in (t for same in roles.values() for t in same):
-            if not fits(topic.role, topic.connection.type):
+        kinds = {role: same[0].connection.type for role, same in roles.items() if same}
+        for role, topic in ((role, t) for role, same in roles.items() for t in same):
+            if not fits(role, topic.connection.type):
                 self.find(ERROR, topic.connection.topic, 'type', 'is '
                           f'{topic.connection.type or "of no type"}, not '
-                          f'{" or ".join(TYPES[topic.role])}', None, remedy(topic.role, free))
+                          f'{" or ".join(TYPES[role])}', None,
+                          remedy(role, free, replaced(role, kinds)))
 
         def candidates(role: str) -> str:
             return proposal(role, free) or 'record it'
@@ -333,16 +335,18 @@ class _Doctor:
 
     def _clocks(self, roles: dict[str, list[HeardTopic]], lags: dict[str, float]) -> None:
         """Stamps against the recorder's clock, and of one sensor against another's."""
-        for topic in (t for role in STAMPED for t in roles[role] if t.jump is not None):
+        for topic in (t for role in STAMPED for t in roles[role]):
+            if topic.jump is None:
+                continue
             jump, at = topic.jump
             self.find(ERROR, topic.connection.topic, 'jump', 'is stamped by a clock that jumps by '
                       f'{jump * 1e-9:.1f} s', at, 'synchronise the clocks (chrony) before '
                       'recording; split the bag here')
-        for topic, lag in lags.items():
+        for name, lag in lags.items():
             if abs(lag) > JUMP:
-                self.find(WARNING, topic, 'skew', f'is stamped {lag * 1e-9:.1f} s before it is '
+                self.find(WARNING, name, 'skew', f'is stamped {lag * 1e-9:.1f} s before it is '
                           'recorded', None, 'synchronise the clocks (chrony)')
-        late, early = max(lags, key=lags.get), min(lags, key=lags.get)
+        late, early = max(lags, key=lags.__getitem__), min(lags, key=lags.__getitem__)
         if lags[late] - lags[early] > SKEW:
             self.find(ERROR, late, 'skew to others', 'is stamped '
                       f'{(lags[late] - lags[early]) * 1e-9:.1f} s earlier than {early} at the '
@@ -386,4 +390,4 @@ def diagnose(path: str | Path, *, topics: Topics | None = None, fov: float | Non
     findings = doctor.conclude(bag)
     seconds = 0.0 if doctor.start is None else (doctor.end - doctor.start) * 1e-9
     figures = sorted((topic.figures() for topic in doctor.topics.values()), key=lambda t: t.topic)
-    return Diagnosis(str(path), seconds, figures, findings)
+    return Diagnosis(str(path), seconds, figures, findings, bag.notes)

@@ -78,6 +78,7 @@ class Diagnosis:
     seconds: float
     topics: list[TopicFigures]
     findings: list[Finding]
+    notes: list[str]  # what is no fault and worth knowing, see `Bag.notes`
 
     @property
     def usable(self) -> bool:
@@ -174,7 +175,7 @@ class Motion:
 
     def pose(self, values: np.ndarray) -> None:
         self.heard += 1
-        if self._first is None:
+        if self._first is None or self._last is None:
             self._first = self._last = values[:3]
         self.reach = max(self.reach, _distance(self._first, values))
         step = _distance(self._last, values)

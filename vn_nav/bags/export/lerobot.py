@@ -268,19 +268,19 @@ class _Dataset:
 
     def _add(self, row: Row, following: Row | None) -> None:
         """Write a row, now that the one after it is known."""
-        goes_on = following is not None and following.episode == row.episode
+        ends = following is None or following.episode != row.episode
+        until = row if following is None or ends else following
         picture = self._decode(row.frame)
         if picture is not None:
             self._video.add(picture)
             self._colours.add(picture)
             self._states.append(row.state)
             self._actions.append(
-                self._commands.mean(row.time, following.time if goes_on else row.time)
-                if self._topics.command
-                else self._odometry.mean(row.at, following.at if goes_on else row.at))
+                self._commands.mean(row.time, until.time) if self._topics.command
+                else self._odometry.mean(row.at, until.at))
         self._commands.forget(row.time)
         self._odometry.forget(row.at)
-        if not goes_on:
+        if ends:
             self._end_episode(row)
 
     def _decode(self, frame: Frame) -> np.ndarray | None:
@@ -305,11 +305,11 @@ class _Dataset:
         if task not in self._tasks:
             self._tasks.append(task)
         frame = np.arange(count)
-        numbers = {
+        numbers: dict[str, np.ndarray] = {
             'timestamp': (frame / self._fps).astype(np.float32), 'frame_index': frame,
             'episode_index': np.full(count, number), 'index': first + frame,
             'task_index': np.full(count, self._tasks.index(task))}
-        columns = {STATE: states, ACTION: actions, **numbers}
+        columns: dict[str, np.ndarray] = {STATE: states, ACTION: actions, **numbers}
         self._table.add(columns)
         stats = {name: describe(values) for name, values in columns.items()}
         stats[CAMERA], self._colours = self._colours.describe(), Colours()
@@ -345,6 +345,7 @@ class _Dataset:
             posed='odometry' if self._topics.odometry else 'the commands alone'))
 
     def _info(self) -> dict:
+        assert self._video.size is not None  # there are frames
         height, width = self._video.size
         features = {
             CAMERA: {'dtype': 'video', 'shape': [height, width, 3],
@@ -392,11 +393,10 @@ class _Video:
         import av
         # 4:2:0 has even sides: an odd row or column is left out.
         height, width = (side - side % 2 for side in picture.shape[:2])
-        if self.size is None:
-            self._begin(height, width)
-        if (height, width) != self.size:
+        size = self.size or self._begin(height, width)
+        if (height, width) != size:
             raise UserError('pictures of a dataset have one size', f'{width} x {height} after '
-                            f'{self.size[1]} x {self.size[0]}', 'split the bag where the camera '
+                            f'{size[1]} x {size[0]}', 'split the bag where the camera '
                             'changes')
         frame = av.VideoFrame.from_ndarray(
             np.ascontiguousarray(picture[:height, :width]), format='rgb24')
@@ -404,7 +404,7 @@ class _Video:
         self._count += 1
         self._file.mux(self._stream.encode(frame))
 
-    def _begin(self, height: int, width: int) -> None:
+    def _begin(self, height: int, width: int) -> tuple[int, int]:
         import av
         if not (height and width):
             raise UserError('a video has two rows and columns at least', f'{width} x {height}',
@@ -416,6 +416,7 @@ class _Video:
             'g': '2', 'bf': '0', 'crf': '20', 'preset': 'veryfast'})
         self._stream.height, self._stream.width = height, width
         self._stream.pix_fmt = 'yuv420p'
+        return self.size
 
     def __exit__(self, *error) -> None:
         if self._file is None:
@@ -431,7 +432,8 @@ class _Table:
     """The numbers of all rows, an episode at a time."""
 
     def __init__(self, folder: Path):
-        self._path, self._file = folder / 'data' / f'{FIRST}.parquet', None
+        self._path = folder / 'data' / f'{FIRST}.parquet'
+        self._file: Any = None  # a ParquetWriter; pyarrow has no types
 
     def __enter__(self) -> _Table:
         return self

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.dataset import MAX_DEPTH, DriveSet
+from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Pictures
 from vn_nav.bags.drive import JUMP
 from vn_nav.bags.mapping.pose_graph import (
     GATE,
@@ -74,7 +74,7 @@ class Straightened(NamedTuple):
     # that is left of odometry where it fits worst, and `strained`, the picture before that
 
 
-def straighten(drives: DriveSet, robot: RobotSpec, pictures: np.ndarray | None = None, *,
+def straighten(drives: DriveSet, robot: RobotSpec, pictures: Pictures | None = None, *,
                stretch: np.ndarray | None = None,
                show: Callable[[float], None] = lambda share: None,
                until: float = math.inf) -> Straightened:
@@ -103,8 +103,11 @@ def straighten(drives: DriveSet, robot: RobotSpec, pictures: np.ndarray | None =
         if rounds and time.monotonic() > until and not drive.stretch.any():
             break
         done = LOOKING + (1 - LOOKING) * rounds / len(ROUNDS)
-        if found.search(solution, loosen, lambda share, done=done: show(
-                done + share * (1 - LOOKING) / len(ROUNDS))):
+
+        def told(share: float, done: float = done) -> None:
+            show(done + share * (1 - LOOKING) / len(ROUNDS))
+
+        if found.search(solution, loosen, told):
             solution = found.settle(solution)
         rounds += 1
     facts = {'pictures': len(drive.odometry), 'keyframes': len(drive.key),
@@ -126,7 +129,7 @@ def straighten(drives: DriveSet, robot: RobotSpec, pictures: np.ndarray | None =
 class _Drive:
     """Odometry, keyframes and nodes of a drive."""
 
-    def __init__(self, drives: DriveSet, robot: RobotSpec, pictures: np.ndarray,
+    def __init__(self, drives: DriveSet, robot: RobotSpec, pictures: Pictures,
                  stretch: np.ndarray | None, show: Callable[[float], None]):
         self.odometry = np.array(drives.pose, np.float64)
         steps = between(self.odometry[:-1], self.odometry[1:])

@@ -62,8 +62,8 @@ def parse_pictures(text: str) -> list[tuple[int, int]]:
     Raises:
         UserError: none.
     """
-    ranges = [tuple(map(int, part.split('-'))) for part in text.split(',')] if (
-        RANGES.fullmatch(text)) else []
+    ranges = [(int(first), int(last)) for first, last in (
+        part.split('-') for part in text.split(','))] if RANGES.fullmatch(text) else []
     if not ranges or any(not 1 <= first <= last for first, last in ranges) or any(
             one[1] >= other[0] for one, other in zip(ranges, ranges[1:], strict=False)):
         raise UserError('pictures of a drive are given as ranges in their order', text,
@@ -150,9 +150,9 @@ def _refuse(part: Part, stretch: np.ndarray, place: np.ndarray, reasons: Sequenc
         words.append(f'{ranges[-1]} ({_clock(part, own[0])} to {_clock(part, own[-1])}{why})')
     more = f' and {len(words) - LISTED} more' if len(words) > LISTED else ''
     places = int(place.max()) + 1
-    own = [','.join(r for r, p in zip(ranges, place, strict=True) if p == number)
-           for number in range(places)]
-    longest = max(own, key=lambda text: sum(b - a for a, b in parse_pictures(text)))
+    named = [','.join(r for r, p in zip(ranges, place, strict=True) if p == number)
+             for number in range(places)]
+    longest = max(named, key=lambda text: sum(b - a for a, b in parse_pictures(text)))
     raise UserError(
         RULE, f'{places} that have nothing in common: pictures '
         f'{"; ".join(words[:LISTED])}{more}', f'learn one place with --pictures {longest}, or, '

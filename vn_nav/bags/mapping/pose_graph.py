@@ -170,7 +170,9 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
             np.add.at(slope, node, -(left @ error[..., None])[..., 0])
             np.add.at(beside, node, left @ by_shares)
             for node2, by2 in sides:
-                np.add.at(blocks, (node, slice(None), node2), left @ by2)
+                # NumPy's annotations know no slice among the indices of `at`.
+                np.add.at(blocks, (node, slice(None), node2),  # type: ignore[arg-type]
+                          left @ by2)
         left = by_shares.transpose(0, 2, 1) @ inverse
         down[size:] -= (left @ error[..., None])[..., 0].sum(axis=0)
         information[size:, size:] += (left @ by_shares).sum(axis=0)

@@ -59,7 +59,9 @@ class Camera:
         self._focal = size / 2 / math.tan(robot.camera_fov / 2)  # pixels
         self._middle = (size - 1) / 2
         self._pitch = robot.camera_pitch
-        self._sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02)
+        # OpenCV's annotations lack the name that every release has.
+        self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]
+            nfeatures=FEATURES, contrastThreshold=0.02)
 
     def look(self, picture: np.ndarray, depth: np.ndarray | None = None) -> Features:
         """Features of a picture.

@@ -136,6 +136,7 @@ def _episode(drives: DriveSet, steps: slice, goal: np.ndarray, checkpoint: Loade
                        'last_action': np.array([before], np.int64),
                        'last_reward': np.zeros(1, np.float32)}
         best = int(policy.act(observation, goals, np.array([before == MISFIT]))[0])
+        assert policy.logits is not None  # it has just acted
         sure = torch.softmax(policy.logits[0].float(), -1).numpy()
         before = int(drives.action[row])
         done = (actions[before] if before != MISFIT

@@ -211,7 +211,9 @@ class Ways:
 
     def _finish(self) -> None:
         """The end of an episode belongs to its way, however near to the point before."""
-        way = self._ways.get(self._last.episode) if self._last is not None else None
+        if self._last is None:
+            return
+        way = self._ways.get(self._last.episode)
         if way is not None and way[-1] is not self._last.pose:
             way.append(self._last.pose)
             self._points += 1

@@ -139,7 +139,7 @@ with the direction the robot faced.</figcaption></figure>"""
 
 
 def _grid(place, low: np.ndarray, high: np.ndarray, unit: float) -> list[Shape]:
-    lines = []
+    lines: list[Shape] = []
     for axis in (0, 1):
         for value in np.arange(math.ceil(low[axis] / unit), math.floor(high[axis] / unit) + 1):
             ends = np.array([low, high])

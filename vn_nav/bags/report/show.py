@@ -89,6 +89,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
     frames = synchronise(_heard(bag, names, velocities), names, report)
     for _ in Cutter(robot, report).cut(watched(frames)):
         pass
+    assert rates.origin is not None  # a camera was found: there are messages
     shown = Shown(diagnosis, rates.origin * 1e-9, names, rates, velocities, way.ways(),
                   film.shots(), goals, odometer, report, robot)
     if checkpoint is not None:

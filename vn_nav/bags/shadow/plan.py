@@ -155,7 +155,8 @@ class _Clock:
     def __init__(self, period: float):
         self._period = period * 1e9
         self._shift = 0
-        self._picture = self._tick = None  # the last ones
+        self._picture: int | None = None  # the last ones
+        self._tick: int | None = None
         self._log_time = 0  # of the last picture
         self._slot = -1
 
@@ -172,6 +173,7 @@ class _Clock:
 
     def tick(self, log_time: int, stamp: int) -> int | None:
         """The stamp of a tick; None: none is due yet."""
+        assert self._picture is not None  # ticks lie within episodes; a picture begins one
         stamp = (stamp + self._shift if stamp
                  else self._picture + max(log_time - self._log_time, 0))
         slot = round(stamp / self._period)
@@ -200,7 +202,8 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
     wanted = dataclasses.replace(topics, depth='', labels='')
     found = find_topics(bag, wanted)
     steps, facts = read_steps(bag, Wanted(robot, topics=wanted), report)
-    decisions, goals, done = [], Goals(goal), None
+    decisions: list[Decision] = []
+    goals, done = Goals(goal), None
     for step in steps:
         frame = step.frame
         _check_times(bag, int(frame.time * 1e9), int(frame.stamp * 1e9))

@@ -5,24 +5,36 @@ A folder is read whole or refused: a file that is left out without a word is a d
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+from collections.abc import Container
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
 from vn_nav.bags.storage.input import Loss
+from vn_nav.bags.storage.recording_names import (
+    KINDS,
+    absent_splits,
+    conversion,
+    converted,
+    has_twin,
+    quoted,
+    recording,
+)
 from vn_nav.bags.storage.records import A_BAG, BagError
+from vn_nav.bags.storage.summary import MAGIC
+
+__all__ = ['METADATA', 'UNLISTED', 'BagFiles', 'OtherFormat', 'converted', 'files_of', 'load_yaml']
 
 METADATA = 'metadata.yaml'
 UNLISTED = 'metadata.yaml does not name it'
+EMPTY = 'is empty'
 MAX_METADATA = 1 << 20  # bytes; a day of hourly files with a hundred topics has 200 kB
 MAX_NESTED = 32  # brackets within brackets
-UNPACK = {  # what compressed files as a whole, and what unpacks them beside themselves
-    '.zst': 'zstd -d', '.zstd': 'zstd -d', '.gz': 'gunzip -k', '.bz2': 'bunzip2 -k',
-    '.xz': 'unxz -k', '.lz4': 'lz4 -d -m'}
-KINDS = {'.db3': 'a bag in SQLite', '.bag': 'a bag of ROS 1', '.mcap': 'an MCAP file'}
+FIRST_BYTES = {MAGIC: '.mcap', b'#ROSBAG V': '.bag'}  # of recordings, whatever their names
 
 
 class OtherFormat(BagError):
@@ -44,13 +56,16 @@ class BagFiles(NamedTuple):
 def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
     """The files of a bag: as its metadata.yaml has them, or by their numbers.
 
-    A compressed file whose unpacked twin lies beside it is read by the twin, as `ros2 bag play`
-    leaves them.
+    Whatever in the folder is a recording by its name or its first bytes is read or refused; hidden
+    files, and folders within, are nobody's concern. A file whose twin without the last ending lies
+    beside it (unpacked, or finished) is read by the twin, as `ros2 bag play` leaves them.
 
     Args:
         path: a rosbag2 folder or an MCAP file.
         strict: a metadata.yaml that is damaged, names a file that is not there, or does not name
-            one that is there, is an error. Otherwise what is there is read, and `losses` tell.
+            one that is there, is an error, and so is an MCAP file that cannot be opened, is empty,
+            or is missing by the numbers of the others. Otherwise what is there is read, and
+            `losses` tell.
 
     Raises:
         OtherFormat: a file in another format, alone or beside MCAP files.
@@ -59,21 +74,34 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
     path = Path(path)
     try:
         if not path.is_dir():
-            if not path.exists():
+            if not os.path.lexists(path):
                 raise BagError(path, 'no such file or folder', rule=A_BAG,
                                remedy='give the path of a recording')
             _refuse_other_formats(path.parent, [path.name], alone=True)
+            if (fault := _fault(path)) is not None and (strict or fault[0] != EMPTY):
+                raise BagError(path, fault[0], rule=A_BAG, remedy=fault[1])
             return BagFiles([path], [])
-        names = sorted((file.name for file in path.iterdir() if file.is_file()), key=_by_number)
+        names = sorted((name for name in os.listdir(path) if not name.startswith('.')),
+                       key=_by_number)
+        faults = {path / name: fault for name in names if Path(name).suffix.lower() == '.mcap'
+                  and (fault := _fault(path / name)) is not None}
+        folders = [name for name in names if (path / name).is_dir()]
     except OSError as error:
         raise BagError(path, f'cannot be looked into ({error.strerror})', rule=A_BAG,
                        remedy='give the path of a recording') from error
-    there = [path / name for name in names if Path(name).suffix.lower() == '.mcap']
+    there = [file for name in names if (file := path / name) not in faults
+             and file.suffix.lower() == '.mcap']
+    if not there:  # then a folder may be a bag of its own, whatever its name
+        faults = {file: fault for file, fault in faults.items() if file.name not in folders}
+    names = [name for name in names if name not in folders]
+    whole = f'`vn_nav bag recover {shlex.quote(str(path))} NEW`'
+    rest = f', or read what is left with {whole}' if there else ''
     if METADATA not in names:
         _refuse_other_formats(path, names)
-        if not there:
+        if not there and not faults:
             raise BagError(path, 'holds no MCAP file', rule=A_BAG, remedy=_elsewhere(path))
-        return BagFiles(there, [])  # the files tell all; the recorder may have been killed before
+        losses = _unreadable(path, there, faults, rest, strict or not there)
+        return BagFiles(there, losses)  # the files tell all; the recorder may have been killed
     try:
         information, listed = _listed(path, names)
     except OtherFormat:
@@ -82,21 +110,62 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
         _refuse_other_formats(path, names)
         if strict or not there:
             raise
-        return BagFiles(there, [Loss(error.path, 0, 0, error.fault, harmless=True)])
-    _refuse_other_formats(path, names)
-    gone = [file for file in listed if file not in there and not file.is_file()]
+        return BagFiles(there, [Loss(error.path, 0, 0, error.fault, harmless=True),
+                                *_unreadable(path, there, faults, rest, strict)])
+    _refuse_other_formats(path, names, listed=[file.name for file in listed])
+    gone = [file for file in listed if file not in faults and not file.is_file()]
     more = [file for file in there if file not in listed]
-    whole = f'`vn_nav bag recover {shlex.quote(str(path))} NEW`'
     if gone and (strict or len(gone) == len(listed) and not more):
-        raise BagError(gone[0], 'metadata.yaml names it, and it is not there', remedy='copy the '
-                       f'bag again, or read what is left with {whole}' if there else
-                       'copy the bag again: none of its files is there')
+        raise BagError(gone[0], 'metadata.yaml names it, and it is not there', remedy=(
+            f'copy the bag again{rest}' if there else
+            'copy the bag again: none of its files is there'))
+    losses = _unreadable(path, [], faults, rest, strict or not there)
     if more and strict:
         raise BagError(more[0], UNLISTED, rule=A_BAG, remedy='put all that is there into one bag '
                        f'with {whole}, or move the file elsewhere')
-    return BagFiles([file for file in listed if file not in gone] + more, [
-        *(Loss(file, 0, 0, 'the file is not there') for file in gone),
+    return BagFiles([file for file in listed if file not in gone and file not in faults] + more, [
+        *(Loss(file, 0, 0, 'the file is not there') for file in gone), *losses,
         *(Loss(file, 0, 0, UNLISTED, harmless=True) for file in more)], *_origin(information))
+
+
+def _fault(path: Path) -> tuple[str, str] | None:
+    """Why a file cannot be read, and what to do; None: it can, whatever is in it."""
+    if path.is_symlink() and not path.exists():
+        return (f'is a link to {os.readlink(path)}, which is not there',
+                'copy the bag with what its links point at (`cp -rL`)')
+    if path.is_dir():
+        return 'is a folder', 'move it elsewhere, or give its own path'
+    if not path.is_file():
+        return 'is no file', 'give the path of a recording'
+    try:
+        with open(path, 'rb') as file:
+            return None if file.read(1) else (EMPTY, 'copy it again, or take it away')
+    except OSError as error:
+        return f'cannot be read ({error.strerror})', 'check its permissions and its disk'
+
+
+def _unreadable(folder: Path, numbered: list[Path], faults: dict[Path, tuple[str, str]],
+                rest: str, strict: bool) -> list[Loss]:
+    """The MCAP files that cannot be read, and those that are missing between the others.
+
+    Args:
+        folder: of the bag.
+        numbered: files whose numbers tell of others.
+        faults: of those that cannot be read.
+        rest: remedy that reads the others.
+        strict: they are an error.
+
+    Raises:
+        BagError: there is such a file, if strict.
+    """
+    found = [(file, *fault) for file, fault in faults.items()]
+    if numbered:
+        found += [(folder / name, 'is not there, by the numbers of the others',
+                   'copy the bag again') for name in absent_splits(
+                       folder.resolve().name, [file.name for file in (*numbered, *faults)])]
+    if found and strict:
+        raise BagError(found[0][0], found[0][1], rule=A_BAG, remedy=found[0][2] + rest)
+    return [Loss(file, 0, 0, what, harmless=what == EMPTY) for file, what, _ in found]
 
 
 def load_yaml(text: str) -> Any:
@@ -113,21 +182,6 @@ def load_yaml(text: str) -> Any:
     if deepest > MAX_NESTED or '<<' in text:
         raise ValueError('brackets within brackets, or merged mappings')
     return yaml.safe_load(text)
-
-
-def converted(source: str | Path) -> str:
-    """The command that writes a recording of another format as MCAP.
-
-    Args:
-        source: a file, a folder or a pattern of files.
-    """
-    source = Path(source)
-    folder = source if source.suffix not in KINDS else (
-        source.parent if '*' in source.name else source.with_suffix(''))
-    if folder.name in ('', '..'):
-        folder = folder.resolve()
-    return (f'`rosbags-convert --src {_quoted(source)} --dst {_quoted(f"{folder}_mcap")} '
-            '--dst-storage mcap`')
 
 
 def _listed(folder: Path, names: list[str]) -> tuple[dict, list[Path]]:
@@ -149,13 +203,14 @@ def _listed(folder: Path, names: list[str]) -> tuple[dict, list[Path]]:
         if Path(name).name != name or name in ('', '..'):
             raise BagError(path, f'it names {name!r}, which is not within the folder',
                            remedy='correct relative_file_paths')
-    anew = f'write the bag anew with {converted(folder)}'
+    anew = f'write the bag anew with {converted(folder, names)}'
     if mode == 'message':
         raise OtherFormat(path, 'its messages are compressed one by one', anew)
     if storage not in ('mcap', ''):
         raise OtherFormat(path, f'its storage is {storage!r}', anew)
-    listed = [twin if (twin := _unpacked(name)) in names else name for name in listed]
-    _refuse_other_formats(folder, listed)
+    listed = [found.name if (found := recording(name)) and found.name in names else name
+              for name in listed]
+    _refuse_other_formats(folder, listed, listed=listed)
     return information, [folder / name for name in listed]
 
 
@@ -168,54 +223,61 @@ def _origin(information: dict) -> tuple[str | None, dict[str, str] | None]:
             {str(key): str(value) for key, value in data.items()} if whole and data else None)
 
 
-def _refuse_other_formats(folder: Path, names: list[str], alone: bool = False) -> None:
-    """Refuse recordings in other formats among some files, with the command that converts.
+def _refuse_other_formats(folder: Path, names: list[str], alone: bool = False,
+                          listed: Container[str] = ()) -> None:
+    """Refuse recordings that are not read as they are, with the command that makes them readable.
 
     Args:
         folder: where they are.
         names: of the files.
-        alone: it is one file that was asked for, and not its folder.
+        alone: it is one file that was asked for, and not its folder: if it begins as an MCAP file
+            it is read, though it may not be finished.
+        listed: names that metadata.yaml has, whatever they are.
     """
     for name in names:
-        twin = _unpacked(name)
-        suffix = Path(twin or name).suffix.lower()
-        if suffix not in KINDS or twin in names or suffix == '.mcap' and twin is None:
+        path, found = folder / name, recording(name)
+        if (found and found.kind == '.mcap' and not found.more or has_twin(name, names)
+                or found is None and name in listed):
             continue
-        if twin is not None:
-            packed = Path(name).suffix
-            pattern = folder / (name if alone else f'*{suffix}{packed}')
-            remedy = f'unpack it with `{UNPACK[packed.lower()]} {_quoted(pattern)}`'
-            what = f'{KINDS[suffix]} that is compressed as a whole'
+        fault = _fault(path) if found and os.path.lexists(path) else None
+        if fault is not None and fault[0] != EMPTY:
+            raise OtherFormat(path, *fault)
+        begins = None if found and found.kind != '.mcap' else _first_bytes(path)
+        if alone and (begins == '.mcap' or found is None):
+            continue
+        if found is not None:
+            what, remedy = conversion(path, found, names, alone)
+        elif begins is not None:
+            what = f'{KINDS[begins]} by its first bytes, under another name'
+            remedy = f'rename it to NAME{begins}, or move it elsewhere'
         else:
-            what = KINDS[suffix]
-            remedy = f'write it anew with {converted(folder / (name if alone else "*" + suffix))}'
+            continue
         if any(Path(other).suffix.lower() == '.mcap' for other in names):
             remedy += ', or give the path of one MCAP file to read that alone'
-        raise OtherFormat(folder / name, what, remedy)
+        raise OtherFormat(path, what, remedy)
 
 
-def _unpacked(name: str) -> str | None:
-    """The name of a compressed recording without what compressed it; None: it is none."""
-    inner, packed = Path(name).stem, Path(name).suffix.lower()
-    return inner if packed in UNPACK and Path(inner).suffix.lower() in KINDS else None
+def _first_bytes(path: Path) -> str | None:
+    """The kind of recording that a file begins as; None: none, or it cannot be looked into."""
+    try:
+        if path.is_file():
+            with open(path, 'rb') as file:
+                begin = file.read(16)
+            return next((kind for bytes_, kind in FIRST_BYTES.items()
+                         if begin.startswith(bytes_)), None)
+    except OSError:
+        pass
+    return None
 
 
 def _elsewhere(folder: Path) -> str:
     """What to do about a folder without a recording."""
     within = sorted(path.parent.name for path in folder.glob(f'*/{METADATA}'))
     if within:
-        return f'give the path of one recording in it, such as {_quoted(folder / within[0])}'
+        return f'give the path of one recording in it, such as {quoted(folder / within[0])}'
     return 'give the path of a recording'
 
 
 def _by_number(name: str) -> list:
     return [(0, int(part), '') if part.isdecimal() else (1, 0, part)
             for part in re.split(r'([0-9]+)', name)]
-
-
-def _quoted(path: str | Path) -> str:
-    """A path for a shell, where a pattern stays one."""
-    path = Path(path)
-    if '*' not in path.name:
-        return shlex.quote(str(path))
-    return f'{shlex.quote(str(path.parent))}/{path.name}'

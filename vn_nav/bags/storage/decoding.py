@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from rosbags.interfaces import Nodetype
 from rosbags.serde.utils import SIZEMAP
@@ -102,7 +102,7 @@ class Decoder:
         """The stamp of a message's header [ns], without decoding it; None: it has none."""
         if not self.learn(message.connection).stamped or len(message.data) < 12:
             return None
-        order = 'little' if message.data[1] & 1 else 'big'
+        order: Literal['little', 'big'] = 'little' if message.data[1] & 1 else 'big'
         return (int.from_bytes(message.data[4:8], order, signed=True) * 1_000_000_000
                 + int.from_bytes(message.data[8:12], order))
 
@@ -140,8 +140,8 @@ def _learn(name: str, encoding: str, definition: bytes) -> _Kind:
         return _kind(known, name)
     store = get_typestore(Stores.ROS2_JAZZY)  # its own: other files may have other types
     fresh = {part: types[part] for part in types if part not in known.fielddefs}
-    fields = {part: own or EMPTY for part, (_, own) in fresh.items()}
-    _least(name, {**{part: own for part, (_, own) in known.fielddefs.items()}, **fields}, {})
+    layouts = {part: own or EMPTY for part, (_, own) in fresh.items()}
+    _least(name, {**{part: own for part, (_, own) in known.fielddefs.items()}, **layouts}, {})
     try:
         store.register(fresh)
         kind = _kind(store, name)

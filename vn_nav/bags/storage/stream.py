@@ -29,7 +29,7 @@ class Topic(NamedTuple):
     """What a bag holds of a topic."""
 
     type: str  # where its publishers disagree: all of them, with ' and ' between
-    count: int
+    count: int  # type: ignore[assignment]  # instead of the tuple's method
 
 
 class Decoded(NamedTuple):
@@ -82,13 +82,19 @@ class Bag:
     @property
     def missing(self) -> int | None:
         """Messages that the files count and that were not read; None: a file does not count."""
-        known = [file.missing for file in self.files]
-        return None if None in known else sum(known)
+        known = [file.missing for file in self.files if file.missing is not None]
+        return sum(known) if len(known) == len(self.files) else None
+
+    @property
+    def surplus(self) -> int:
+        """Messages that were read and that the files do not count."""
+        return sum(file.surplus for file in self.files)
 
     @property
     def notes(self) -> list[str]:
         """What is no damage and worth knowing, after reading with `strict=False`."""
-        notes, passed = [], collections.Counter()
+        notes: list[str] = []
+        passed: collections.Counter[int] = collections.Counter()
         if without := sum(file.unchecked > 0 for file in self.files):
             which = f'{without} of {len(self.files)} files have' if len(self.files) > 1 else (
                 f'{self.files[0].path} has')
@@ -124,9 +130,10 @@ class Bag:
 
     def _ahead(self) -> int | None:
         """The time [ns] before which nothing is still to be read; None: unknown."""
-        known = [self.files[self._reading].ahead,
+        ahead = [self.files[self._reading].ahead,
                  *(file.start for file in self.files[self._reading + 1:])]
-        return None if None in known else min(known)
+        known = [time for time in ahead if time is not None]
+        return min(known) if len(known) == len(ahead) else None
 
     def topics(self) -> dict[str, Topic]:
         """The topics that have messages, by their names as recorded.

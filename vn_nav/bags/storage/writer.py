@@ -181,14 +181,14 @@ class BagWriter:
                 if item:
                     self._put(item)
                 if time.monotonic() >= self._due:
-                    self._file.flush()
-                    self._file.sync()
+                    self._present.flush()
+                    self._present.sync()
                     self._count()
                     self._check_room()
                     if told != (told := self.written.total()):
                         self._write_metadata()
                     self._due = time.monotonic() + FLUSH
-            self._file.flush()
+            self._present.flush()
         except Exception as error:  # also a bug must not leave writers waiting for ever
             self._stop(error)
         try:
@@ -197,6 +197,12 @@ class BagWriter:
                 self._end_file(spare=len(self._describe()) + 8192 if self.stopped else 0)
         except Exception as error:
             self._stop(error)
+
+    @property
+    def _present(self) -> McapOutput:
+        """The file that is being written: there is one until the bag is finished."""
+        assert self._file is not None
+        return self._file
 
     def _take(self, due: float) -> _Waiting | None:
         """The next message, unless none comes in time or ever."""
@@ -215,23 +221,24 @@ class BagWriter:
         if self._unchecked >= CHUNK:
             self._check_room()
         if self._channels and (
-                0 < self._max_bytes <= self._file.size
+                0 < self._max_bytes <= self._present.size
                 or 0 < self._max_seconds <= time.monotonic() - self._begun):
-            self._file.flush()
+            self._present.flush()
             self._end_file()
             self._begin_file()
         channel = item.channel
         if channel not in self._channels:
-            self._channels[channel] = self._file.channel(
+            self._channels[channel] = self._present.channel(
                 channel.name, channel.topic.type, channel.definition,
                 {'offered_qos_profiles': _yaml([_quality(channel.topic)]),
                  'topic_type_hash': channel.digest})
             self._due = min(self._due, time.monotonic() + SOON)
-        self._file.add(self._channels[channel], item.data, item.stamp, item.sequence)
+        self._present.add(self._channels[channel], item.data, item.stamp, item.sequence)
 
     def _stop(self, error: Exception) -> None:
-        words = (error.strerror if isinstance(error, OSError)
-                 else f'{type(error).__name__}: {error}')
+        # Not every OSError has a number and words of the system.
+        words = ((error.strerror if isinstance(error, OSError) else None)
+                 or f'{type(error).__name__}: {error}')
         with self._change:
             self.stopped = self.stopped or words
             self._queue.clear()
@@ -253,9 +260,8 @@ class BagWriter:
         self._write_metadata(folder=True)
 
     def _end_file(self, spare: int = 0) -> None:
-        file = self._file
         try:
-            file.finish(spare)
+            self._present.finish(spare)
         finally:
             self._count()
             self._file = None
@@ -266,11 +272,11 @@ class BagWriter:
 
     def _count(self) -> None:
         """Look at what the present file holds."""
-        present = self._files[-1]
-        present.span = self._file.span
+        present, file = self._files[-1], self._present
+        present.span = file.span
         present.counts = collections.Counter(
-            {channel: self._file.counts[number] for channel, number in self._channels.items()
-             if self._file.counts[number]})
+            {channel: file.counts[number] for channel, number in self._channels.items()
+             if file.counts[number]})
         written: collections.Counter[str] = collections.Counter()
         for channel, count in self._counts().items():
             written[channel.name] += count

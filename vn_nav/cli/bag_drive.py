@@ -1,4 +1,4 @@
-"""What `vn_nav bag drive` does, and what it prints."""
+"""`vn_nav bag drive`: what a policy would have done along a recorded drive."""
 
 from __future__ import annotations
 
@@ -130,8 +130,9 @@ def _told(folder: Path, driven) -> str:
 def _compare(outs: list[Path], folders: list[Path], latencies: list[list[float]], out: Path
              ) -> None:
     same = folders[0].name == folders[1].name
-    labels = tuple(str(folder) if same else folder.name for folder in folders)
-    found = compare(read_shadow(outs[0]), read_shadow(outs[1]), labels, tuple(latencies))
+    one, other = (str(folder) if same else folder.name for folder in folders)
+    found = compare(read_shadow(outs[0]), read_shadow(outs[1]), (one, other),
+                    (latencies[0], latencies[1]))
     for name, text in (('comparison.json', as_json(found)), ('comparison.md', markdown(found))):
         try:
             write_file(out / name, text.encode())
