@@ -57,6 +57,7 @@ soak: $(READY)
 	@VN_NAV_KILLS=200 $(BIN)/python -m pytest test/learning/test_survival.py test/learning/test_distributed.py \
 	 -k 'loses_no_committed_update or torchrun_replaces'
 	@VN_NAV_MUTATIONS=50000 $(BIN)/python -m pytest test/bags/test_bag_hostile.py -k mutated
+	@VN_NAV_FLIPS=20000 $(BIN)/python -m pytest test/bags/test_bag_flips.py -s
 	@mkdir -p runs && VN_NAV_SOAK=1 VN_NAV_FIGURES=runs/safety.jsonl\
 	 $(BIN)/python -m pytest test/nodes/test_soak.py -s
 	@VN_NAV_PICTURE_MUTATIONS=100000 $(BIN)/python -m pytest test/messages/test_picture_files.py -k mutated

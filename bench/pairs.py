@@ -94,7 +94,7 @@ def measure(policy: Policy, validation: PairSampler) -> dict:
         pairs = validation.draw(256)
         pose, _ = look(policy, np.concatenate([pairs['image'], pairs['goal']]), np.arange(256),
                        np.arange(256, 512))
-        for name, rows in (('position', pose.position), ('overlap', pose.overlap),
+        for name, rows in (('position', pose.position), ('overlap', pose.co_visible),
                            ('truth', pairs['goal_pose'][:, :2]), ('share', pairs['overlap'])):
             found[name].append(np.asarray(rows))
     position, overlap, truth, share = (np.concatenate(rows) for rows in found.values())

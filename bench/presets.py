@@ -22,7 +22,7 @@ from common import pin, report
 
 from vn_nav.learning.distributed import Processes
 from vn_nav.learning.presets import ENVIRONMENT, preset
-from vn_nav.learning.trainer import Training
+from vn_nav.learning.training import Training
 from vn_sim_bridge.navigation.env import PRIVILEGED, EnvConfig, NavigationEnv
 
 WARM_UP = 4  # updates

@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 from common import pin, report
 
-from vn_nav.cli.train import config_over_ros
 from vn_nav.learning.distributed import Processes
+from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, preset
-from vn_nav.learning.trainer import Training
+from vn_nav.learning.training import Training
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv

@@ -44,7 +44,8 @@ from peers_train import (
     map_side,
 )
 
-from vn_nav.learning.learner import Learner, LearnerConfig
+from vn_nav.learning.learner import Learner
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.rollout import Collector
 from vn_nav.policy.network import NetworkConfig, Policy
 

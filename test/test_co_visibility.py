@@ -1,11 +1,11 @@
-"""overlap: what two views share, against independent computations."""
+"""Co-visibility: what two views share, against independent computations."""
 
 import math
 
 import numpy as np
 import pytest
 
-from vn_nav.co_visibility import FARTHEST, GRID, lift, overlap, relative_pose
+from vn_nav.co_visibility import FARTHEST, GRID, co_visible, lift, relative_pose
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 from vn_sim_bridge.render.randomisation import load_randomisation
@@ -45,12 +45,12 @@ def test_a_view_shares_everything_with_itself_and_nothing_with_its_back(env):
     poses[:, :2] = env.backend.poses[:, :2]
     depth, cameras, fov = look(env, poses)
     points = lift(depth, cameras, fov)
-    assert (overlap(points, depth, cameras, fov) == 1.0).all()
+    assert (co_visible(points, depth, cameras, fov) == 1.0).all()
     other, cameras, fov = look(env, poses, seed=1)  # another fov, height and pitch
-    assert overlap(points, other, cameras, fov).min() > 0.85
+    assert co_visible(points, other, cameras, fov).min() > 0.85
     poses[:, 2] += math.pi
     behind, cameras, fov = look(env, poses)
-    assert (overlap(points, behind, cameras, fov) == 0.0).all()
+    assert (co_visible(points, behind, cameras, fov) == 0.0).all()
 
 
 def test_points_lie_on_the_surfaces_that_are_seen(env):
@@ -62,7 +62,7 @@ def test_points_lie_on_the_surfaces_that_are_seen(env):
     depth[0], depth[1] = 0.0, FARTHEST + 0.1
     points = lift(depth, cameras, fov)
     assert np.isnan(points[:2]).all() and not np.isnan(points[2:]).any()
-    assert (overlap(points, depth, cameras, fov)[:2] == 0).all()
+    assert (co_visible(points, depth, cameras, fov)[:2] == 0).all()
 
 
 def brute_force(goal_camera, goal_fov, goal_depth, camera, fov, depth):

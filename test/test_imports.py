@@ -1,6 +1,7 @@
 """ROS stays at the edge, and the packages depend on each other one way only."""
 
 import ast
+import importlib
 import importlib.util
 import os
 import subprocess
@@ -74,6 +75,14 @@ def test_dependencies(path):
     package = name_of(path).partition('.')[0]
     if package == 'vn_nav' and not name_of(path).startswith('vn_nav.cli.'):
         assert 'vn_sim_bridge' not in roots(path), 'only vn_nav.cli composes with the simulator'
+    own = {node.module for node in ast.walk(ast.parse(path.read_text()))
+           if isinstance(node, ast.ImportFrom) and node.module.partition('.')[0] in PACKAGES}
+    places = {name: ROOT / name.replace('.', '/') for name in own}
+    missing = [name for name, place in places.items()
+               if not (place.with_suffix('.py').is_file() or place.is_dir())]
+    assert not missing, f'no such module, in a function perhaps: {missing}'
+    if not name_of(path).startswith('vn_nav.cli.'):
+        assert 'argparse' not in roots(path), 'options of a command end in vn_nav.cli'
     if package == 'vn_sim_bridge':
         allowed = LEAVES | (NODE_SHARED if at_the_edge(path) else set())
         used = {name for name in names if name.startswith('vn_nav.')
@@ -120,6 +129,33 @@ def test_the_rest_imports_without_ros(tmp_path):
         env={**os.environ, 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'})
     assert result.returncode == 0, result.stdout + result.stderr
     assert f'imported {len(names)}' in result.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('package, heavy', [
+    ('vn_nav.learning', 'torch'), ('vn_nav.evaluation', 'torch'), ('vn_nav.cli.nodes', 'argparse'),
+    ('vn_nav.cli.commands', 'torch')])
+def test_a_package_is_light_until_something_of_it_is_used(package, heavy):
+    code = f"""
+import sys
+before = set(sys.modules)
+import {package}
+new = set(sys.modules) - before
+sys.exit(f'{heavy} is imported' if {heavy!r} in new else 0)
+"""
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize('package', ['vn_nav.learning', 'vn_nav.evaluation'])
+def test_what_a_package_exports_is_what_its_name_says(package):
+    """None is hidden by a module of the same name, whatever was imported before."""
+    module = importlib.import_module(package)
+    folder = ROOT / package.replace('.', '/')
+    for name in module.__all__:
+        assert callable(getattr(module, name)) and not (folder / f'{name}.py').exists()
+    with pytest.raises(AttributeError, match='nothing_such'):
+        getattr(module, 'nothing_such')  # noqa: B009
 
 
 LIGHT = """

@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-# What poses alone say, see `overlap_by_poses`.
+# What poses alone say, see `co_visible_by_poses`.
 NEAR = 1.0  # m driven between them
 AHEAD = 5.0  # m that a goal straight ahead may be away
 STRAIGHT = 1.1  # metres driven for each metre of the straight line
@@ -63,8 +63,8 @@ def lift(depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray) -> np.ndarray:
     return points.reshape(len(depth), -1, 3).astype(np.float32)
 
 
-def overlap(points: np.ndarray, depth: np.ndarray, cameras: np.ndarray,
-            fov: np.ndarray) -> np.ndarray:
+def co_visible(points: np.ndarray, depth: np.ndarray, cameras: np.ndarray,
+               fov: np.ndarray) -> np.ndarray:
     """Share of some points that a picture shows too.
 
     A point counts as seen where it falls into the picture and its depth agrees with that of the
@@ -79,11 +79,11 @@ def overlap(points: np.ndarray, depth: np.ndarray, cameras: np.ndarray,
     """
     size = depth.shape[-1]
     focal = size / 2 / np.tan(np.asarray(fov, float) / 2)
-    return _overlap(points, depth, np.ascontiguousarray(cameras[:, :3]), _axes(cameras),
-                    np.ascontiguousarray(focal))
+    return _co_visible(points, depth, np.ascontiguousarray(cameras[:, :3]), _axes(cameras),
+                       np.ascontiguousarray(focal))
 
 
-def overlap_by_poses(goal_pose: np.ndarray, driven: np.ndarray, fov: float) -> np.ndarray:
+def co_visible_by_poses(goal_pose: np.ndarray, driven: np.ndarray, fov: float) -> np.ndarray:
     """Whether pictures show the same, as far as poses alone say so.
 
     1: no more than `NEAR` was driven between them and the headings differ by less than half a
@@ -123,7 +123,7 @@ def _axes(cameras: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _overlap(points, depth, origin, axes, focal):
+def _co_visible(points, depth, origin, axes, focal):
     count, most = points.shape[:2]
     size = depth.shape[1]
     share = np.zeros(count, np.float32)

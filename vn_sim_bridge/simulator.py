@@ -116,7 +116,7 @@ class Simulator(Backend, Protocol):
 
     def cameras(self, poses: np.ndarray | None = None, appearance: Any = None
                 ) -> tuple[np.ndarray, np.ndarray]:
-        """Cameras [K,5] and fov [K] of poses, or of the last pictures; see `overlap.lift`."""
+        """Cameras [K,5] and fov [K] of poses, or of the last pictures: `co_visibility.lift`."""
 
     def overlap(self, goal_poses: np.ndarray) -> np.ndarray:
         """For backends without depth: what poses alone say of the overlap, [N]; -1: nothing."""

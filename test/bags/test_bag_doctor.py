@@ -27,10 +27,10 @@ from small_bags import (
     twist,
     write,
 )
-from vn_nav.bags.doctor.checks.checks import ERROR, WARNING, diagnose
 
 from vn_nav import cli
 from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.doctor.checks import ERROR, WARNING, diagnose
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.robot import RobotSpec
 

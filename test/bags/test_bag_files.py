@@ -19,11 +19,11 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from small_bags import STORE, STRING, drive, make, serialised, write
-from vn_nav.bags.doctor.checks.checks import diagnose
-from vn_nav.bags.doctor.checks.recover import recover
 
 from vn_nav import cli
 from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.doctor.checks import diagnose
+from vn_nav.bags.doctor.recover import recover
 from vn_nav.bags.storage.stream import Bag, BagError, messages, summary
 from vn_nav.robot import RobotSpec
 

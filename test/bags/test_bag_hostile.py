@@ -27,9 +27,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, Schema
 from paths import TESTS
 from small_bags import START, STORE, STRING, chunk_record, drive, make, records, whole, write
-from vn_nav.bags.doctor.checks.checks import diagnose
-from vn_nav.bags.doctor.checks.recover import recover
 
+from vn_nav.bags.doctor.checks import diagnose
+from vn_nav.bags.doctor.recover import recover
 from vn_nav.bags.storage.stream import Bag, BagError, messages
 
 MUTATIONS = int(os.environ.get('VN_NAV_MUTATIONS', 1500))

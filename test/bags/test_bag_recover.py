@@ -16,9 +16,9 @@ from mcap.writer import IndexType
 from paths import TESTS
 from rosbags.highlevel import AnyReader
 from small_bags import START, STRING, drive, make, records, serialised, write
-from vn_nav.bags.doctor.checks.recover import recover
 
 from vn_nav import cli
+from vn_nav.bags.doctor.recover import recover
 from vn_nav.bags.storage.stream import Bag, BagError
 from vn_nav.errors import UserError
 

@@ -35,8 +35,8 @@ from mcap.records import (
 )
 from mcap.writer import CompressionType, IndexType, Writer
 from small_bags import MAGIC, chunk_record, whole
-from vn_nav.bags.doctor.checks.recover import recover
 
+from vn_nav.bags.doctor.recover import recover
 from vn_nav.bags.storage.records import BagError
 from vn_nav.bags.storage.stream import Bag, summary
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from vn_nav.bags.doctor.checks.checks import diagnose
 
 from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.bags.storage.writer import BagWriter
@@ -77,7 +77,7 @@ def test_most_pictures_have_another_of_their_place_in_their_episode(bag, tmp_pat
     pairs = Drives([drives], ROBOT)
     rows, goals = np.array([(i, j) for first, stop in pairs.episodes for i in range(first, stop)
                             for j in range(first, stop) if i != j]).T
-    assert (pairs.overlap(rows, goals) >= 0.1).mean() > 0.25
+    assert (pairs.co_visibility(rows, goals) >= 0.1).mean() > 0.25
 
 
 def test_labels_of_pairs_are_those_of_the_sampler(tmp_path):
@@ -91,7 +91,7 @@ def test_labels_of_pairs_are_those_of_the_sampler(tmp_path):
     row = np.array([at[tuple(np.round([x, y, np.cos(yaw)], 6))] for x, y, yaw, _ in poses])
     first, second = row[groups['first']], row[groups['second']]
     assert np.allclose(pairs.label(first, second).goal_pose, groups['goal_pose'], atol=1e-4)
-    errors = np.abs(pairs.overlap(first, second) - groups['overlap'])
+    errors = np.abs(pairs.co_visibility(first, second) - groups['overlap'])
     assert errors.mean() < 0.01 and (errors < 0.15).mean() > 0.99  # depth in steps of 4 cm
 
 

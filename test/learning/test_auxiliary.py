@@ -189,7 +189,7 @@ def test_goal_pose_loss_counts_only_what_is_in_view():
         overlaps = rollout.privileged['overlap'][t, env] >= 0.1
         if overlaps:
             seen.append(error[0] + error[1] + 2 * (error[2] + error[3]))
-        probability = 1 / (1 + math.exp(-latents.pose.overlap[row].item()))
+        probability = 1 / (1 + math.exp(-latents.pose.co_visible[row].item()))
         crossed.append(-math.log(probability if overlaps else 1 - probability))
     expected = sum(seen) / len(seen) + sum(crossed) / len(crossed)
     assert float(loss.detach()) == pytest.approx(expected, rel=1e-4)

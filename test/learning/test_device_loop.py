@@ -19,7 +19,8 @@ from vn_nav.learning.presets import preset
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector
 from vn_nav.learning.state_file import read_state
-from vn_nav.learning.trainer import STATE, train
+from vn_nav.learning.trainer import train
+from vn_nav.learning.training import STATE
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv

@@ -16,7 +16,8 @@ from two_bars import TwoBars, collected
 
 from vn_nav.learning import returns
 from vn_nav.learning.distributed import Processes
-from vn_nav.learning.learner import Learner, LearnerConfig
+from vn_nav.learning.learner import Learner
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.presets import TrainConfig, preset
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Rollout

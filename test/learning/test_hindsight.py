@@ -9,7 +9,7 @@ from round_room import ROBOT, drive_set, look
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.bags.dataset import DriveSet
 from vn_nav.bags.drive import MISFIT
-from vn_nav.co_visibility import lift, overlap
+from vn_nav.co_visibility import co_visible, lift
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import (
     Drives,
@@ -64,7 +64,7 @@ def test_labels_are_those_of_a_plain_loop():
 def test_overlap_is_measured_where_there_is_depth_as_the_simulator_measures_it():
     drives = some_drives()
     rows, goals = all_pairs(drives)
-    found = drives.overlap(rows, goals)
+    found = drives.co_visibility(rows, goals)
     exact = look(drives.pose)[1]
     errors = []
     for k in range(0, len(rows), 7):
@@ -73,7 +73,7 @@ def test_overlap_is_measured_where_there_is_depth_as_the_simulator_measures_it()
                             for m in pair])
         fov = np.full(2, ROBOT.camera_fov)
         points = lift(exact[pair[1:]], cameras[1:], fov[1:])
-        errors.append(found[k] - overlap(points, exact[pair[:1]], cameras[:1], fov[:1])[0])
+        errors.append(found[k] - co_visible(points, exact[pair[:1]], cameras[:1], fov[:1])[0])
     # Stored depth has steps of 4 cm: a column of points may cross the edge of a picture.
     assert np.abs(errors).max() <= 0.13 and np.abs(errors).mean() < 0.01
     assert (found == 0).any() and (found > 0.5).any() and (found >= 0).all()
@@ -83,10 +83,10 @@ def test_one_bag_without_depth_does_not_spoil_that_of_the_other():
     mixed = Drives([drive_set(4), drive_set(4, depth=False)], ROBOT)
     rows, goals = all_pairs(mixed)
     here = rows < len(mixed.sets[0])
-    found = mixed.overlap(rows, goals)
+    found = mixed.co_visibility(rows, goals)
     own = Drives(mixed.sets[:1], ROBOT)
-    assert np.array_equal(found[here], own.overlap(rows[here], goals[here]))
-    assert np.array_equal(found[~here], mixed.overlap_by_odometry(rows[~here], goals[~here]))
+    assert np.array_equal(found[here], own.co_visibility(rows[here], goals[here]))
+    assert np.array_equal(found[~here], mixed.co_visibility_by_odometry(rows[~here], goals[~here]))
     assert set(found[~here]) == {-1.0, 0.0, 1.0}
 
 
@@ -115,7 +115,7 @@ def house_drive(houses=(3, 4)):
 def test_what_odometry_says_of_the_overlap_is_seldom_wrong_in_houses():
     drives = Drives([house_drive()], ROBOT)
     rows, goals = all_pairs(drives)
-    said, true = drives.overlap_by_odometry(rows, goals), drives.overlap(rows, goals)
+    said, true = drives.co_visibility_by_odometry(rows, goals), drives.co_visibility(rows, goals)
     ones, zeros = said == 1, said == 0
     assert ones.sum() > 1000 and zeros.sum() > 300
     assert (true[ones] >= 0.1).mean() > 0.97 and (true[zeros] < 0.1).mean() > 0.9

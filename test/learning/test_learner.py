@@ -10,7 +10,9 @@ from two_bars import KEYS, TwoBars, collected
 
 from vn_nav.errors import UserError
 from vn_nav.learning import auxiliary
-from vn_nav.learning.learner import BASIC_LOSSES, Learner, LearnerConfig, select
+from vn_nav.learning.batches import select
+from vn_nav.learning.learner import BASIC_LOSSES, Learner
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.presets import PRESETS, TrainConfig, preset
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector

@@ -8,7 +8,7 @@ import pytest
 
 from vn_nav.cli.train import add_train_options, train_config
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import TASKS
+from vn_nav.learning.learner_config import TASKS
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.robot import DRIVE_ACTIONS
 
@@ -70,9 +70,9 @@ def test_thesis_learns_in_what_table_5_1_says():
 @pytest.mark.parametrize('size, cells, cell', [(84, 20, 4), (174, 42, 4)])
 def test_thesis_has_downsize_factor_4_and_its_heads(size, cells, cell):
     """Table 5.1: pixel control and auxiliary VN downsize factor."""
-    from vn_nav.policy.network import Policy
+    from vn_nav.policy.zhu_policy import build_policy
     config = preset('thesis').network(DRIVE_ACTIONS, size)
-    network = Policy(config)
+    network = build_policy(config)
     assert (network.target_side, network.cell) == (cells, cell)
     assert set(config.heads) == {'pixel_control', 'reward_prediction', 'depth', 'segmentation',
                                  'goal_segmentation'}
@@ -159,5 +159,11 @@ def test_values_of_every_kind_are_taken():
     assert (config.gamma, config.frames, config.clip, config.channels, config.track_goal,
             config.teacher) == (1.0, 2_000_000, None, (8, 16, 8), True, 'oracle')
     assert isinstance(config.gamma, float) and isinstance(config.frames, int)
+    assert train_config(parse('--set', 'seed=5', '--set', 'tensorboard=true')).seed == 5
     config = train_config(parse('--preset', 'icra2017', '--set', 'frozen_weights=2015'))
     assert config.frozen_weights == '2015'  # a file's name, whatever it looks like
+
+
+def test_a_number_may_have_any_name():
+    with pytest.raises(UserError, match='a training has only the numbers'):
+        preset('fast', **{'name': 1})

@@ -14,7 +14,7 @@ from vn_nav.errors import UserError
 from vn_nav.learning.auxiliary import POSE_OVERLAP, image_target
 from vn_nav.learning.hindsight import Drives, partners, rows_of, split
 from vn_nav.learning.pairs import errors, measure
-from vn_nav.learning.pretrain import STATE, PretrainConfig, choose_parts, pretrain
+from vn_nav.learning.pretraining import STATE, PretrainConfig, choose_parts, pretrain_network
 from vn_nav.learning.state_file import read_state
 from vn_nav.learning.supervised import Batch, Guess, Objective, Tally
 from vn_nav.policy.checkpoint import load_checkpoint
@@ -45,8 +45,8 @@ def learn(drives, folder, config=QUICK, network=None, parts=None, **options):
     """Pre-train on the parts that there are; the folder of the checkpoint."""
     network = network or network_of()
     parts = parts or choose_parts(drives, network.config.heads, (), None)[0]
-    return pretrain(network, drives, parts, split(drives, 0.15, 0), folder, config, info=FACTS,
-                    **options)
+    return pretrain_network(network, drives, parts, split(drives, 0.15, 0), folder, config,
+                            info=FACTS, **options)
 
 
 @pytest.mark.slow
@@ -68,7 +68,7 @@ def test_actions_and_poses_are_learned_and_hold_on_other_episodes(tmp_path):
     first, second = rows_of(spans), partners(spans, np.random.default_rng(1))
     asked = {'image': drives.pictures('image', first), 'goal': drives.pictures('image', second),
              'goal_pose': drives.label(first, second).goal_pose,
-             'overlap': drives.overlap(first, second)}
+             'overlap': drives.co_visibility(first, second)}
     learned = measure(load_checkpoint(tmp_path / 'checkpoint').network, asked)
     mean = torch.from_numpy(asked['goal_pose'][asked['overlap'] >= POSE_OVERLAP].mean(axis=0))
     guess = errors(Pose(*mean.expand(len(first), 4).split(2, dim=1), torch.ones(len(first))),

@@ -18,7 +18,8 @@ from faults import no_file_beyond
 from two_bars import TwoBars, collected
 
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import Learner, LearnerConfig
+from vn_nav.learning.learner import Learner
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.log import Log
 from vn_nav.learning.presets import TrainConfig, preset
 from vn_nav.learning.replay import Replay

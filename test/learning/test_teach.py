@@ -1,5 +1,6 @@
 """`vn_nav teach`: from a bag to a policy for the place where it was driven."""
 
+import importlib.util
 import json
 import math
 import re
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from paths import ROOT
 from ros_harness import write_checkpoint
 from small_bags import (
     IMAGE,
@@ -25,9 +27,6 @@ from small_bags import (
     picture,
     serialised,
 )
-from vn_nav.cli.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
-from vn_nav.cli.teaching import OWN
-from vn_sim_bridge.teach_place_place import draw_map, held_out, make_env, make_pairs
 
 from vn_msgs_py.topics import topic
 from vn_nav.bags.mapping.pose_graph import between, compose
@@ -37,15 +36,21 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.presets import preset
 from vn_nav.learning.stages import Stages
+from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.learning.teach_job import TeachJob
+from vn_nav.learning.teach_network import OWN
+from vn_nav.learning.teaching import teach
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_sim_bridge import teach_place as place
 from vn_sim_bridge.floor.contacts import WORLD_VERSION
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.recorded.image_graph import build_graph
 from vn_sim_bridge.robot.joystick import Joystick
 from vn_sim_bridge.robot.simulated_robot import TICK
 from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.teach_place import draw_map, held_out, make_env, make_pairs
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 SIZE = 36
@@ -385,7 +390,39 @@ def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, caps
     assert torch.equal(again.actor.weight, taught.network.actor.weight)
 
 
+@pytest.mark.slow
+def test_a_drive_is_taught_from_python(driven, tmp_path):
+    """As examples/pretrain_and_teach.py does it."""
+    spec = importlib.util.spec_from_file_location(
+        'pretrain_and_teach', ROOT / 'examples' / 'pretrain_and_teach.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    write_bag(tmp_path / 'bag', *driven)
+    folder = module.main(str(tmp_path / 'bag'), str(tmp_path / 'runs'), 0.1, epochs=1, size=SIZE,
+                         episodes=2)
+    taught = load_checkpoint(folder)
+    assert taught.config.hidden == 128 and taught.config.places and taught.info['command'] == ''
+    before = load_checkpoint(tmp_path / 'runs' / 'pretrained' / 'checkpoint')
+    assert before.info['losses'] and torch.equal(before.network.critic.weight,
+                                                 taught.network.critic.weight)
+    assert (tmp_path / 'runs' / 'taught' / 'evaluation.json').is_file()
+
+
+@pytest.mark.parametrize('fields, rule', [
+    ({'minutes': 0}, 'some time to learn'), ({'episodes': 0}, 'at least one episode'),
+    ({'places': 1}, '2 to 1024'), ({'envs': 0}, 'at least one robot'),
+    ({'size': 84, 'checkpoint': 'models/house'}, 'size is that of the checkpoint')])
+def test_a_job_that_cannot_be_done_is_refused_where_it_is_written(fields, rule):
+    with pytest.raises(UserError, match=rule):
+        TeachJob('bag', 'out', **fields)
+
+
+def test_numbers_of_a_training_that_do_not_exist_are_refused(tmp_path):
+    with pytest.raises(UserError, match='a training has only the numbers .*nonsense'):
+        teach(TeachJob('bag', tmp_path / 'out', changes={'nonsense': 1}), place)
+    assert not (tmp_path / 'out').exists()
+
+
 def raise_of(bag, out):
     """Teach again where something was taught already."""
-    from vn_nav.cli import build_parser, run_teach
-    run_teach(build_parser().parse_args(['teach', str(bag), '--out', str(out)]))
+    teach(TeachJob(bag, out), place)

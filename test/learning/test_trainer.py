@@ -11,7 +11,8 @@ from two_bars import TwoBars
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import TrainConfig, preset
 from vn_nav.learning.state_file import read_state
-from vn_nav.learning.trainer import STATE, train
+from vn_nav.learning.trainer import train
+from vn_nav.learning.training import STATE
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
 

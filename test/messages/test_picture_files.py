@@ -23,11 +23,11 @@ import pytest
 from paths import TESTS
 from picture_bytes import chunk, encoded, jpeg, photo, png, segment, with_exif
 from small_bags import START, make, write
-from vn_nav.bags.doctor.checks.checks import diagnose
 
 from vn_msgs_py.image_error import ForeignFormatError, ImageError
 from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.picture_file import decode_picture
+from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.goal_picture import KEPT_SIDE_PX, MAX_JPEG_PX
 
 MUTATIONS = int(os.environ.get('VN_NAV_PICTURE_MUTATIONS', 3000))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import own_frames
+from vn_nav.learning.batches import own_frames
 from vn_nav.learning.presets import preset
 from vn_nav.learning.rollout import Collector
 from vn_nav.policy.network import Policy

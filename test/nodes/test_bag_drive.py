@@ -39,7 +39,7 @@ from vn_nav.bags.storage.reader import read_bag
 from vn_nav.bags.storage.stream import messages
 from vn_nav.cli import main
 from vn_nav.errors import UserError
-from vn_nav.nodes import shadow
+from vn_nav.nodes import shadow_domain
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
 
@@ -249,15 +249,16 @@ def stranger():
 
 @pytest.mark.ros
 def test_a_domain_where_somebody_is_is_not_taken(stranger, monkeypatch):
-    monkeypatch.setattr(shadow, 'ALONE', 60.0)  # it ends with the first that is heard of
+    monkeypatch.setattr(shadow_domain, 'ALONE', 60.0)  # it ends with the first that is heard of
     stranger(231)
     with pytest.raises(UserError, match='231: .*stranger'):
-        shadow._Domain([231])
-    monkeypatch.setattr(shadow, 'ALONE', 0.1)
-    with shadow._Domain(range(225, 230)) as one, shadow._Domain(range(225, 231)) as other:
+        shadow_domain.Domain([231])
+    monkeypatch.setattr(shadow_domain, 'ALONE', 0.1)
+    with (shadow_domain.Domain(range(225, 230)) as one,
+          shadow_domain.Domain(range(225, 231)) as other):
         assert one.number != other.number and one.namespace != other.namespace
         with pytest.raises(UserError, match='another shadow'):
-            shadow._Domain([one.number])
+            shadow_domain.Domain([one.number])
 
 
 def alone(runtime, drives, robot):

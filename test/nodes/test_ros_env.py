@@ -20,17 +20,18 @@ from rclpy.executors import SingleThreadedExecutor
 from ros_harness import PATIENCE, child, wait_until
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Bool, UInt8
-from vn_nav.bags.doctor.checks.checks import diagnose
 
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import fill_odometry, twist_to_array
 from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.drive import integrate
 from vn_nav.cli import main
-from vn_nav.cli.train import config_over_ros
 from vn_nav.errors import EnvironmentLost, UserError
+from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, preset
-from vn_nav.learning.trainer import STATE, train
+from vn_nav.learning.trainer import train
+from vn_nav.learning.training import STATE
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.ros_env import RosEnv
 from vn_nav.policy.checkpoint import load_checkpoint

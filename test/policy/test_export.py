@@ -13,8 +13,9 @@ from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import LoadedCheckpoint, save_checkpoint
 from vn_nav.policy.checkpoint_info import INFO
 from vn_nav.policy.export import OPSET, export_onnx
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import NetworkConfig
 from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 onnx = pytest.importorskip('onnx', reason='expected: onnx, of the extra `onnx`, is not installed')
@@ -49,8 +50,8 @@ def one_thread():
 
 def network_of(name):
     """A network whose actions differ clearly, unlike those of a new one."""
-    network = Policy(NetworkConfig(**{'actions': DRIVE_ACTIONS, 'size': 64, 'hidden': 32,
-                                      **NETWORKS[name]})).eval()
+    network = build_policy(NetworkConfig(**{'actions': DRIVE_ACTIONS, 'size': 64, 'hidden': 32,
+                                            **NETWORKS[name]})).eval()
     for part in network.actor.parameters():
         part.data.normal_()
     return network

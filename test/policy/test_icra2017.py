@@ -10,16 +10,18 @@ from torch.nn import functional as F
 from two_bars import TwoBars, collected
 
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import Learner, LearnerConfig
+from vn_nav.learning.learner import Learner
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, preset
 from vn_nav.learning.rollout import Collector
 from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import NetworkConfig
 from vn_nav.policy.resnet import ResNet50, load_frozen_weights
 from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.zhu import RandomFeatures, scene_numbers
+from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
@@ -176,7 +178,7 @@ def test_code_in_a_file_of_weights_does_not_run(tmp_path):
 
 def test_layers_have_the_papers_sizes():
     config = preset('icra2017', frozen_weights='resnet50.pth', scenes=4).network(DRIVE_ACTIONS, 84)
-    network = Policy(config)
+    network = build_policy(config)
     shapes = {name: tuple(part.shape) for name, part in network.named_parameters()
               if part.requires_grad}
     assert shapes == {
@@ -199,7 +201,7 @@ def test_the_small_encoder_is_the_same_every_time():
 
 @pytest.mark.parametrize('config', [ZHU, SCENES], ids=['one scene', 'scenes'])
 def test_the_network_equals_its_layers_by_hand(config):
-    network = Policy(config)
+    network = build_policy(config)
     for part in (network.memory, network.actor, network.critic):
         torch.nn.init.normal_(part.bias)
     observation, starts = seen(scenes=config.scenes if config.scenes > 1 else 0)
@@ -232,7 +234,7 @@ def test_the_network_equals_its_layers_by_hand(config):
 @pytest.mark.parametrize('config', [ZHU, dataclasses.replace(ZHU, frames=1), SCENES],
                          ids=['four frames', 'one frame', 'scenes'])
 def test_stepwise_equals_the_sequence_across_resets(config):
-    network = Policy(config)
+    network = build_policy(config)
     observation, starts = seen(scenes=config.scenes)
     state = network.initial_state(3)
     whole, last = network(observation, starts, state)
@@ -245,7 +247,7 @@ def test_stepwise_equals_the_sequence_across_resets(config):
 
 
 def test_known_features_stand_for_pictures():
-    network = Policy(ZHU)
+    network = build_policy(ZHU)
     observation, starts = seen()
     wanted, _ = network(observation, starts)
     known = observation._replace(image=torch.zeros_like(observation.image),
@@ -257,7 +259,7 @@ def test_known_features_stand_for_pictures():
 
 def test_each_picture_passes_the_frozen_encoder_once():
     counted, env = [], TwoBars(6)
-    network = Policy(dataclasses.replace(ZHU, actions=TwoBars.action_names))
+    network = build_policy(dataclasses.replace(ZHU, actions=TwoBars.action_names))
     network.encoder.frozen.register_forward_pre_hook(lambda _, inputs: counted.append(
         len(inputs[0])))
     collector = Collector(env, network, torch.Generator().manual_seed(0))
@@ -274,7 +276,7 @@ def _config():
 
 
 def test_an_update_leaves_the_frozen_weights_alone():
-    network = Policy(dataclasses.replace(ZHU, actions=TwoBars.action_names))
+    network = build_policy(dataclasses.replace(ZHU, actions=TwoBars.action_names))
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     rollout = collected(network, steps=5)
     learner = Learner(network, _config(), torch.Generator())
@@ -287,7 +289,7 @@ def test_an_update_leaves_the_frozen_weights_alone():
 
 
 def test_a_scene_teaches_its_own_layers_alone():
-    network = Policy(SCENES)
+    network = build_policy(SCENES)
     observation, starts = seen(scenes=3)
     observation.extras['scene'].fill_(1)
     output, _ = network(observation, starts)
@@ -301,7 +303,7 @@ def test_a_scene_teaches_its_own_layers_alone():
 def test_rollouts_know_the_house_of_every_row():
     env = NavigationEnv(EnvConfig(houses=(1, 2, 3), rooms=1, num_envs=2, size=36, seed=5,
                                   max_decisions=3))
-    network = Policy(SCENES)
+    network = build_policy(SCENES)
     collector = Collector(env, network, torch.Generator().manual_seed(0))
     collector.begin(0)
     homes = [env.house_index.copy()]
@@ -322,7 +324,7 @@ def test_rollouts_know_the_house_of_every_row():
 
 def test_more_houses_than_scenes_are_refused():
     env = NavigationEnv(EnvConfig(houses=(1, 2, 3), rooms=1, num_envs=3, size=36))
-    collector = Collector(env, Policy(dataclasses.replace(ZHU, scenes=2)), torch.Generator())
+    collector = Collector(env, build_policy(dataclasses.replace(ZHU, scenes=2)), torch.Generator())
     collector.begin(0)
     with pytest.raises(UserError, match='scene 2'):
         collector.collect(2)
@@ -330,7 +332,7 @@ def test_more_houses_than_scenes_are_refused():
 
 def test_unknown_scenes_are_refused():
     env = TwoBars(3)
-    policy = BatchedPolicy(Policy(dataclasses.replace(SCENES, actions=env.action_names)), 3)
+    policy = BatchedPolicy(build_policy(dataclasses.replace(SCENES, actions=env.action_names)), 3)
     observation, info = env.reset(seed=0)
     acted = policy.act(observation, env.goals, info['reset'], np.array([0, 2, 1]))
     assert acted.shape == (3,)
@@ -344,7 +346,7 @@ def test_unknown_scenes_are_refused():
 
 
 def test_scenes_change_what_a_policy_does():
-    network = Policy(SCENES)
+    network = build_policy(SCENES)
     for scene in range(3):
         network.actor.bias.data[scene, scene] = 50.0
     env = TwoBars(3)
@@ -355,7 +357,7 @@ def test_scenes_change_what_a_policy_does():
 
 
 def test_a_checkpoint_brings_its_frozen_weights(tmp_path):
-    network = Policy(SCENES)
+    network = build_policy(SCENES)
     network.encoder.frozen.conv1.weight.data *= 2  # as if they came from a file
     save_checkpoint(tmp_path / 'zhu', network, {
         'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0})
@@ -373,10 +375,10 @@ def test_the_preset_has_the_papers_numbers():
     assert config.entropy_coefficient == config.final_entropy_coefficient == 0.01
     assert (config.optimiser, config.rmsprop_epsilon) == ('rmsprop', 0.1)
     assert (config.learning_rate, config.final_learning_rate) == (7e-4, 0.0)
-    group = Learner(Policy(config.network(DRIVE_ACTIONS, 36)), config,
+    group = Learner(build_policy(config.network(DRIVE_ACTIONS, 36)), config,
                     torch.Generator()).optimiser.param_groups[0]
     assert (group['alpha'], group['eps']) == (0.99, 0.1)
-    default = Learner(Policy(ZHU), LearnerConfig(optimiser='rmsprop'), torch.Generator())
+    default = Learner(build_policy(ZHU), LearnerConfig(optimiser='rmsprop'), torch.Generator())
     assert default.optimiser.param_groups[0]['eps'] == 1e-5
 
 

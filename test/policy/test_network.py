@@ -416,7 +416,7 @@ def test_bfloat16_stays_close_to_float32(architecture, frames):
         rows = latents.hidden.flatten(0, 1)
         outputs[dtype] = {
             'logits': output.logits, 'value': output.value, 'hidden': latents.hidden,
-            'position': latents.pose.position, 'overlap': latents.pose.overlap,
+            'position': latents.pose.position, 'overlap': latents.pose.co_visible,
             'pixel_control': network.heads['pixel_control'](rows),
             'depth': network.heads['depth'](latents.maps),
             'distance': network.heads['distance'](latents.hidden)}

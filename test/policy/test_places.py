@@ -10,12 +10,11 @@ import pytest
 import torch
 from corridor_drive import ROBOT, SIZE, corridor_graph
 from torch.nn import functional as F
-from vn_nav.cli.teaching import _widened
-from vn_sim_bridge.teach_place_place import make_views, regrets
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import imitation_loss
 from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spots
+from vn_nav.learning.teach_network import widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.policy.places import HEADINGS, MultiViewAveraging
@@ -24,6 +23,7 @@ from vn_sim_bridge.datasets.recorded_views import GraphViews
 from vn_sim_bridge.recorded.pose_lattice import MOST
 from vn_sim_bridge.recorded.relight import draw_light, relight
 from vn_sim_bridge.simulators.recorded import ImageGraphBackend
+from vn_sim_bridge.teach_place import make_views, regrets
 
 SIDE = 36
 CONFIG = NetworkConfig(actions=ROBOT.action_names, size=SIDE, channels=(8, 8, 8), features=16,
@@ -124,14 +124,14 @@ def observe(network, seed=0, steps=3, envs=2):
 def test_a_policy_that_is_told_of_a_place_begins_as_it_was():
     before = Policy(dataclasses.replace(CONFIG, places=0))
     after = Policy(CONFIG)
-    after.load_state_dict(_widened(before.state_dict(), after))
+    after.load_state_dict(widened(before.state_dict(), after))
     starts = torch.zeros(3, 2, dtype=torch.bool)
     seen = observe(before)
     for one, other in zip(before(seen, starts)[0][:2], after(seen, starts)[0][:2], strict=True):
         assert torch.allclose(one, other, atol=1e-5)
     # And again, of another place: what it knew of the first one is no use.
     again = Policy(dataclasses.replace(CONFIG, places=9))
-    again.load_state_dict(_widened(after.state_dict(), again))
+    again.load_state_dict(widened(after.state_dict(), again))
 
 
 def test_no_gradient_changes_where_places_are():

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 from corridor_drive import ROBOT, SIZE, corridor_graph, graph_of, line, show, spin
-from vn_sim_bridge.teach_place_place import held_out, make_env, make_pairs
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
@@ -19,6 +18,7 @@ from vn_sim_bridge.recorded.image_graph import KEPT, build_graph
 from vn_sim_bridge.recorded.pose_lattice import GAP, HEADING, TURNED_MOST, _components
 from vn_sim_bridge.simulators.house import HouseBackend
 from vn_sim_bridge.simulators.recorded import ImageGraphBackend, turned
+from vn_sim_bridge.teach_place import held_out, make_env, make_pairs
 
 SLACK = CELL + HEADING
 

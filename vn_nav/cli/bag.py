@@ -1,4 +1,4 @@
-"""What `vn_nav bag` does: options and output."""
+"""`vn_nav bag`: check, repair, show, export and drive along recorded drives."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from vn_nav.errors import UserError
 
 
-def add_bag_commands(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     """The actions of `vn_nav bag`."""
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
@@ -74,7 +74,7 @@ def _add_drive(parser: argparse.ArgumentParser) -> None:
 
 def run_doctor(args) -> int:
     """`vn_nav bag doctor`: 0 where the bag can be used, 1 where it cannot."""
-    from vn_nav.bags.doctor.checks.checks import diagnose
+    from vn_nav.bags.doctor.checks import diagnose
     from vn_nav.bags.roles import load_topics
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise UserError('a file is written into a folder that exists', str(args.json),
@@ -94,7 +94,7 @@ def run_doctor(args) -> int:
 
 def run_recover(args) -> int:
     """`vn_nav bag recover`: 0, with what was lost told; if strict, 2 where something was."""
-    from vn_nav.bags.doctor.checks.recover import recover
+    from vn_nav.bags.doctor.recover import recover
     recovered = recover(args.bag, args.out)
     print('\n'.join(recovered.lines()))
     return 2 if args.strict and recovered.lost else 0
@@ -139,7 +139,7 @@ def run_export(args) -> int:
 
 def run_drive(args) -> int:
     """`vn_nav bag drive`: 0; 130 after SIGINT or SIGTERM, with what was recorded until then."""
-    from vn_nav.bags.shadow.run import run
+    from vn_nav.cli.bag_drive import run
     out = args.out or Path(f'{args.bag.resolve().stem}_shadow')
     return run(args.bag, args.checkpoint, out, other=args.compare, robot=args.robot,
                topics=_topics(args.topics), goal=args.goal, decoding=args.decoding)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import json
 import re
@@ -14,6 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from vn_nav.cli.world import load_for_house, make_env
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode, drives_from_bag
 from vn_nav.evaluation.evaluator import (
@@ -46,8 +48,27 @@ RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground
             'episode_result', 'scene', '/diagnostics']
 
 
-def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
-        unseen_episodes: int = 10) -> int:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of `vn_nav demo`."""
+    parser.add_argument('--out', type=Path, default=Path('demo'), help='folder for bag and page')
+    parser.add_argument('--episodes', type=int, default=20, help='in the trained house')
+    parser.add_argument('--unseen-episodes', type=int, default=10, help='in an unseen house')
+    parser.add_argument('--checkpoint', type=Path, help='instead of the shipped policy')
+
+
+def run(args: argparse.Namespace) -> int:
+    """`vn_nav demo`."""
+    folder = args.checkpoint or share_file('models/house')
+    task = load_for_house(folder)[0].info['task']  # refuse before anything is written
+    if task != 'image':
+        raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
+                        task, 'use vn_nav evaluate')
+    return demonstrate(args.out, folder, episodes=args.episodes,
+                       unseen_episodes=args.unseen_episodes)
+
+
+def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes: int = 10
+                ) -> int:
     """Drive, record, measure, report.
 
     A checkpoint with a stop threshold has to declare its stop; for others arriving is enough.
@@ -55,7 +76,6 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
     Args:
         out: folder for bag, page and result.json; what an earlier demo left there is replaced.
         folder: of the checkpoint.
-        make_env: as `cli.world.make_env`, for the controls without ROS.
         episodes, unseen_episodes: in the trained and in the unseen house.
 
     Returns:
@@ -95,7 +115,7 @@ def run(out: Path, folder: Path, *, make_env: Callable, episodes: int = 20,
                       f'of SIGINT and had to be killed[/]; logs are in {out / "logs"}')
         return 1
     drives = drives_from_bag(out / 'bag', pictures=True)
-    result = _results(drives, places, loaded, make_env)
+    result = _results(drives, places, loaded)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
                'checkpoint': folder.name, 'date': datetime.date.today().isoformat()}
     write_report(out / 'report.html', drives, result)
@@ -194,8 +214,7 @@ def _progress(done: list[tuple], count: int) -> Table:
     return table
 
 
-def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint,
-             make_env: Callable) -> dict:
+def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint) -> dict:
     """Figures from the bag; on the same starts random actions, and the policy without ROS."""
     info, result = checkpoint.info, {}
     stop = _stop(info)

@@ -1,27 +1,44 @@
-"""What `vn_nav evaluate` and `vn_nav compare` do apart from the simulator: options and output."""
+"""`vn_nav evaluate`: a checkpoint in houses, or in a recorded drive."""
 
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from vn_nav.bags.mapping.recorded_place import (
+from vn_nav.cli.options import (
     add_place_options,
-    check_place_options,
+    check_folders,
     given_place_options,
+    place_options,
+)
+from vn_nav.cli.world import (
+    add_world,
+    check_backend,
+    check_world,
+    load_for,
+    make_env_for,
 )
 from vn_nav.errors import UserError
+from vn_nav.evaluation import evaluator
+from vn_nav.evaluation.measurement import EvaluateConfig, evaluate
+from vn_nav.files import write_file
+from vn_nav.learning.teach_evaluation import DRIVE_SPLITS
+from vn_nav.report import tables
+from vn_nav.report.evaluation_page import evaluation_page
+from vn_nav.robot import load_robot
 
 OF_HOUSES = ('house', 'houses', 'rooms', 'randomisation')  # options without meaning in a bag
-DRIVE_SPLITS = ('seen_goals', 'unseen_goals')  # as `vn_nav teach` learns goals, and holds them out
 SPLIT_HOUSES = 20  # of a split that the checkpoint does not know, unless told otherwise
+UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
-def add_evaluate_options(parser: argparse.ArgumentParser) -> None:
-    """Options of `vn_nav evaluate`, beside those of the world."""
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of `vn_nav evaluate`."""
+    parser.add_argument('checkpoint', type=Path)
+    add_world(parser, defaults=False)
     parser.add_argument('--split', action='append', metavar='NAME',
                         help='train, validation, test, unseen_look (other houses), seen_goals or '
                         "unseen_goals (in the checkpoint's own houses; the first of the two is "
@@ -45,35 +62,50 @@ def add_evaluate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--maps', type=int, default=6, help='of episodes of each split')
 
 
-def add_compare_options(parser: argparse.ArgumentParser) -> None:
-    """Options of `vn_nav compare`."""
-    parser.add_argument('runs', nargs='+', type=Path, metavar='RUN', help='folder with '
-                        'metrics.csv; NAME-seed1, NAME-seed2, ... are seeds of one curve')
-    parser.add_argument('--out', type=Path, default=Path('compare.html'),
-                        help='page (.html) or picture (.svg, .png)')
-    parser.add_argument('--metric', default='success', help='a column of metrics.csv')
-    parser.add_argument('--labels', nargs='+', metavar='LABEL', help='a name for each run; equal '
-                        'names are seeds of one curve')
-    parser.add_argument('--band', choices=('range', 'std'), default='range', help='over seeds: '
-                        'from the smallest to the largest, or one standard deviation each way')
-    parser.add_argument('--log', action='store_true', help='logarithmic frames and minutes')
-    parser.add_argument('--json', type=Path, metavar='FILE', help='also write the table here')
+def run(args: argparse.Namespace) -> int:
+    """`vn_nav evaluate`."""
+    check_backend(args.backend)
+    _check(args)
+    config = EvaluateConfig(
+        episodes=args.episodes, seed=args.seed, decoding=args.decoding,
+        controls=() if args.no_controls else evaluator.CONTROLS,
+        stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None)
+    checkpoint, robot = load_for(args.checkpoint, args.robot)
+    bag = args.bag.name if args.bag else None
+
+    def show(name: str, result: dict) -> None:
+        split = result['splits'][name]
+        title = (f'{args.checkpoint}, {tables.place(name, split["houses"], bag)}, '
+                 f'{args.max_decisions} decisions at most')
+        tables.print_rows(split['rows'], title)
+        if args.per_scene and not args.bag:
+            tables.print_scenes(split['scenes'], title)
+
+    with tempfile.TemporaryDirectory() as decoded:  # the pictures of a drive are mapped from there
+        splits, make_env = (
+            _drive(args, checkpoint, robot, args.cache or Path(decoded)) if args.bag else
+            _houses(args, checkpoint))
+        done = evaluate(checkpoint, splits, make_env, config, name=str(args.checkpoint), bag=bag,
+                        on_split=show)
+    if args.json:
+        write_file(args.json, json.dumps(done.result, indent=2).encode())
+    if args.html:
+        page = evaluation_page(done.result, done.measured, done.plans, maps=args.maps)
+        write_file(args.html, page.encode())
+    return 0
 
 
-def check_evaluate_options(args) -> None:
+def _check(args: argparse.Namespace) -> None:
     """Refuse before hours of work what would fail after them.
 
     Raises:
         UserError: which option, and why.
     """
     rules = (
-        (args.episodes >= 1, 'there is at least one episode', args.episodes, 'raise --episodes'),
         (args.houses is None or args.houses >= 1, 'a split has at least one house', args.houses,
          'raise --houses'),
         (not (args.house and (args.split or args.houses)), 'houses are given by seed or by split',
          '--house together with --split or --houses', 'leave one of them out'),
-        (args.stop_threshold is None or 0 <= args.stop_threshold < 1,
-         'the stop threshold lies in [0, 1)', args.stop_threshold, 'choose a value in range'),
         (args.maps >= 0, 'the number of maps is not negative', args.maps, 'raise --maps'),
     )
     for kept, rule, received, remedy in rules:
@@ -84,12 +116,11 @@ def check_evaluate_options(args) -> None:
     elif given := given_place_options(args):
         raise UserError('pictures with poses are made a place in a recorded drive',
                         f'{", ".join(given)} without --bag', 'give --bag')
-    _check_folders(args.json, args.html)
+    check_folders(args.json, args.html)
 
 
-def _check_drive(args) -> None:
+def _check_drive(args: argparse.Namespace) -> None:
     """Whether the options are for a recorded drive."""
-    check_place_options(args)
     for name in OF_HOUSES:
         if getattr(args, name) is not None:
             raise UserError('a recorded drive has pictures and a size of its own',
@@ -100,54 +131,66 @@ def _check_drive(args) -> None:
                             name, 'choose one of them, or leave out --split')
 
 
-def _check_folders(*files: Path | None) -> None:
-    for file in files:
-        if file is not None and not file.absolute().parent.is_dir():
-            raise UserError('a file is written into a folder that exists', str(file),
-                            'make the folder, or choose another place')
+def _splits(args: argparse.Namespace, info: dict) -> dict[str, list[int]]:
+    """The houses of each split that is asked for."""
+    from vn_sim_bridge.houses.splits import SPLITS
+    if args.house:
+        return {'houses': list(dict.fromkeys(args.house))}
+    found = {}
+    for name in args.split or ['seen_goals']:
+        if name in ('seen_goals', 'unseen_goals'):
+            found[name] = info['houses'][:args.houses]
+            if not found[name]:
+                raise UserError('seen and unseen goals are in the houses of the checkpoint',
+                                'a checkpoint that names none', 'give --house or another --split')
+        elif name in SPLITS:
+            found[name] = list(SPLITS[name][:args.houses or SPLIT_HOUSES])
+            known = sorted(set(found[name]) & set(info['houses']))
+            if name != 'train' and known:
+                raise UserError(f'the checkpoint was not trained in houses of split {name}',
+                                f'house {known[0]}', 'choose another split')
+        else:
+            raise UserError(f'a split is one of {", ".join(SPLITS)}, seen_goals, unseen_goals',
+                            name, 'choose one of them')
+    return found
 
 
-def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) -> None:
-    """Measure every split, print its tables, write JSON and page.
+def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
+    """The houses of each split, and what makes environments of them."""
+    from vn_sim_bridge.floor.contacts import WORLD_VERSION
+    check_world(checkpoint.info, WORLD_VERSION)
+    rooms = args.rooms or checkpoint.info['rooms']
+    if rooms is None:
+        raise UserError('houses have a number of rooms', 'a checkpoint that names none',
+                        'give --rooms')
+    splits = _splits(args, checkpoint.info)
 
-    Args:
-        args: of the command line.
-        info: of the checkpoint.
-        splits: seeds of the houses by the split's name.
-        measure: (split, houses) -> episodes as of `evaluator.measure`, floor plans by seed.
-    """
-    from vn_nav.evaluation import evaluator
-    from vn_nav.files import write_file
-    from vn_nav.report import tables
-    from vn_nav.report.evaluation_page import evaluation_page
-    result = {
-        'checkpoint': str(args.checkpoint), 'sha256': info['sha256'],
-        'bag': args.bag.name if args.bag else None,
-        'world_version': info['world_version'], 'task': info['task'],
-        'decoding': args.decoding or info['decoding'], 'max_decisions': args.max_decisions,
-        'seed': args.seed, 'date': datetime.date.today().isoformat(), 'splits': {}}
-    measured, plans = {}, {}
-    for name, houses in splits.items():
-        measured[name], plans[name] = measure(name, houses)
-        scenes = evaluator.by_scene(measured[name])
-        result['splits'][name] = split = {
-            'houses': houses, 'rows': evaluator.figures(measured[name]),
-            'scenes': {str(seed): evaluator.figures(scenes[seed]) for seed in houses}}
-        title = (f'{args.checkpoint}, {tables.place(name, houses, result["bag"])}, '
-                 f'{args.max_decisions} decisions at most')
-        tables.print_rows(split['rows'], title)
-        if args.per_scene and not args.bag:
-            tables.print_scenes(split['scenes'], title)
-    if args.json:
-        write_file(args.json, json.dumps(result, indent=2).encode())
-    if args.html:
-        write_file(args.html, evaluation_page(result, measured, plans, maps=args.maps).encode())
+    def make(split: str, seeds, environments: int, stop: str):
+        return make_env_for(
+            checkpoint, seeds, rooms, environments, stop=stop, robot=args.robot,
+            own=set(splits[split]) <= set(checkpoint.info['houses']),
+            randomisation=args.randomisation, max_decisions=args.max_decisions,
+            goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0)
+    return splits, make
 
 
-def run_compare(args) -> int:
-    """`vn_nav compare`."""
-    from vn_nav.report.compare import compare
-    _check_folders(args.out, args.json)
-    compare(args.runs, args.out, metric=args.metric, labels=args.labels, band=args.band,
-            log=args.log, json_file=args.json)
-    return 0
+def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[dict, Callable]:
+    """The goals of each split in a recorded drive, and what makes environments there."""
+    from vn_nav.bags.mapping.recorded_place import read_place
+    from vn_sim_bridge import teach_place as place
+    graph = read_place(args.bag, place_options(args), place.build_graph, robot,
+                       checkpoint.config.size, cache)
+    check_world(checkpoint.info, graph.world_version)
+    graphs = {'all_goals': graph}
+    if args.split:
+        own, others = place.held_out(graph)
+        if others is None:
+            raise UserError('there are enough goals to hold some out',
+                            f'{len(graph.goals)} goals', 'leave out --split')
+        divided = dict(zip(DRIVE_SPLITS, (own, others), strict=True))
+        graphs = {name: divided[name] for name in args.split}
+
+    def make(split: str, _, environments: int, stop: str):
+        return place.make_env(graphs[split], robot, environments, stop=stop, light=True,
+                              task=checkpoint.info['task'], max_decisions=args.max_decisions)
+    return {name: [graph.seed] for name in graphs}, make

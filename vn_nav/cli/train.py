@@ -1,16 +1,19 @@
-"""What `vn_nav train` takes from the command line: a preset, and changes to it."""
+"""`vn_nav train`: a policy by reinforcement, in houses or behind ROS topics."""
 
 from __future__ import annotations
 
 import argparse
-import ast
-import dataclasses
-from collections.abc import Collection
+import datetime
+import math
 from pathlib import Path
 
+from vn_nav.cli.options import command_words, parse_changes
+from vn_nav.cli.world import add_world, check_backend, machine, make_env
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import PRIVILEGED
+from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
+from vn_nav.learning.pretrain_job import load_bags, print_line
+from vn_nav.learning.trainer import train
 from vn_nav.robot import DRIVE_ACTIONS
 
 # Options that are numbers of `TrainConfig`, with their words.
@@ -46,8 +49,14 @@ WORLD = {
 }
 
 
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of `vn_nav train`."""
+    add_world(parser)
+    add_train_options(parser)
+
+
 def add_train_options(parser: argparse.ArgumentParser) -> None:
-    """Everything but where to train."""
+    """Options of `vn_nav train`, beside those of the world."""
     parser.add_argument('--preset', choices=tuple(PRESETS), default='fast',
                         help='where every number comes from that is not given')
     parser.add_argument('--out', type=Path, required=True, help='folder of the run')
@@ -94,7 +103,7 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
                         '-r image_raw:=/camera/image_raw -p patience:=600.0')
 
 
-def check_train_options(args: argparse.Namespace) -> None:
+def _check(args: argparse.Namespace) -> None:
     """Refuse options that have no meaning together.
 
     Raises:
@@ -120,53 +129,6 @@ def check_train_options(args: argparse.Namespace) -> None:
                         'give one of them')
 
 
-def config_over_ros(config: TrainConfig, world: dict, offers: Collection[str], lock_step: bool
-                    ) -> tuple[TrainConfig, list[str]]:
-    """What of a training can be learned where only topics say what happens.
-
-    Heads whose task is left out stay, so that the checkpoint of a simulator fits and bags can go
-    on teaching them.
-
-    Args:
-        config: as it would be in a simulator.
-        world: options of the environment, of `WORLD`.
-        offers: keys of `info` that the topics can give.
-        lock_step: the robot is simulated and waits.
-
-    Returns:
-        The configuration, and what is left out and why, in words.
-
-    Raises:
-        UserError: a device or architecture for which goals must be known before they are seen;
-            or motion while the learner is busy.
-    """
-    rules = (
-        (config.device == 'cpu', 'goals that come one by one are kept on the CPU',
-         f'--device {config.device}', 'leave --device out'),
-        (config.architecture != 'icra2017', 'goals that come one by one are encoded anew',
-         'the architecture icra2017, which does so once', 'choose another --preset'),
-        (lock_step or not config.overlap, 'a robot stands still while the learner is busy',
-         '--overlap', 'leave it out, or train in --lock-step'),
-    )
-    for kept, rule, received, remedy in rules:
-        if not kept:
-            raise UserError(rule, received, remedy)
-    lost = [name for name in config.tasks if not set(PRIVILEGED.get(name, ())) <= set(offers)
-            or name == 'imitation']
-    words = [f'{name} is left out: no topic says {" or ".join(PRIVILEGED.get(name, ("it",)))}'
-             for name in lost]
-    words += [f'{name} is left out: no topic says it'
-              for name in ('progress_reward', 'exploration_reward') if world.get(name)]
-    if config.start_difficulty < 1:
-        words.append('there is no curriculum: robots start where they are')
-    if config.pair_minutes:
-        words.append("there are no picture pairs: they are the simulator's")
-    return dataclasses.replace(
-        config, **dict.fromkeys(lost, 0.0), teacher_share=0.0, pair_minutes=0.0,
-        start_difficulty=1.0, extra_heads=(*config.extra_heads, *(
-            name for name in lost if name != 'imitation'))), words
-
-
 def train_config(args: argparse.Namespace) -> TrainConfig:
     """The preset with the changes of the command line.
 
@@ -174,22 +136,124 @@ def train_config(args: argparse.Namespace) -> TrainConfig:
         UserError: an unknown name or a value outside its range.
     """
     changes = {name: getattr(args, name) for name in CHANGES if getattr(args, name) is not None}
-    known = {field.name: field.default for field in dataclasses.fields(TrainConfig)}
-    for text in args.set:
-        name, equals, value = text.partition('=')
-        if not equals or name not in known:
-            raise UserError('--set takes NAME=VALUE with a number of TrainConfig', text,
-                            f'the names are {", ".join(sorted(known))}')
-        try:
-            changes[name] = ast.literal_eval({'true': 'True', 'false': 'False'}.get(value, value))
-        except (ValueError, SyntaxError):
-            changes[name] = value
-        if isinstance(known[name], str):
-            changes[name] = value  # a word, whatever it looks like
-    return preset(args.preset, **changes, seed=args.seed, tensorboard=not args.no_tensorboard)
+    return preset(args.preset, **{'seed': args.seed, 'tensorboard': not args.no_tensorboard,
+                                  **changes, **parse_changes(args.set)})
 
 
 def world_options(args: argparse.Namespace) -> dict:
     """The environment's options: the preset's with the changes of the command line."""
     given = {name: getattr(args, name) for name in WORLD if getattr(args, name) is not None}
     return {'exploration_reward': 0.0, **ENVIRONMENT[args.preset], **given}
+
+
+def run(args: argparse.Namespace) -> int:
+    """`vn_nav train`."""
+    check_backend(args.backend)
+    _check(args)
+    if args.env == 'ros':
+        return _over_ros(args)
+    from vn_sim_bridge.houses.splits import SPLITS
+    from vn_sim_bridge.navigation.env import PRIVILEGED
+    houses = args.house or list(SPLITS['train'][:args.houses or 1])
+    config, world = train_config(args), world_options(args)
+    env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
+                   randomisation=args.randomisation, size=args.size, seed=args.seed,
+                   device=config.device,
+                   actions=tuple(args.actions.split(',')), task=args.task,
+                   objects=args.objects, goals_per_room=args.goals_per_room,
+                   goal_variants=args.goal_variants,
+                   privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
+    bags = _bag_mix(args, config, env.robot)
+    info = _info(args, config, env, bags) | {
+        'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
+        'goals_per_room': args.goals_per_room, 'goal_variants': args.goal_variants,
+        'task': args.task, 'objects': args.objects}
+    pairs = None
+    if config.pair_minutes and not args.init:
+        pairs = _pair_sources(args, config)
+    print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
+                pairs=pairs, bags=bags))
+    return 0
+
+
+def _info(args: argparse.Namespace, config, env, bags) -> dict:
+    """What every checkpoint of a training says."""
+    taught = '' if bags is None else (
+        f', beside {len(bags.drives):,} steps of {len(args.bags)} bag{"s" * (len(args.bags) > 1)}')
+    return {
+        'preset': args.preset,
+        'command': command_words(),
+        'camera_fov_deg': math.degrees(env.robot.camera_fov),
+        'camera_height': env.robot.camera_height,
+        'notes': f'Trained on {machine(config.device)}, {config.threads} thread(s), '
+                 f'{datetime.date.today().isoformat()}{taught}.',
+        'world_version': env.world_version,
+    }
+
+
+def _bag_mix(args: argparse.Namespace, config, robot):
+    """The bags that a training learns from as well; None: there are none."""
+    if not args.bags:
+        return None
+    from vn_nav.bags.roles import Topics, load_topics
+    from vn_nav.learning.bag_mix import BagMix
+    drives, _ = load_bags(args.bags, robot, args.size,
+                          load_topics(args.topics) if args.topics else Topics(),
+                          args.cache or args.out / 'decoded', print_line)
+    bags = BagMix(drives, config)
+    parts = ', '.join(bags.parts).replace('_', ' ')
+    for line in (*bags.words, f'bags teach {parts}'):
+        print(line, flush=True)
+    return bags
+
+
+def _over_ros(args: argparse.Namespace) -> int:
+    """`vn_nav train --env ros`."""
+    import torch
+
+    from vn_nav.robot import RobotSpec, load_robot
+    try:
+        from vn_nav.nodes.ros_env import RosEnv
+    except ImportError as error:
+        raise UserError('training over ROS needs rclpy and the common messages', str(error),
+                        "source ROS 2, or pip install 'vn_nav[ros]'") from error
+    if torch.distributed.is_torchelastic_launched():
+        raise UserError('one process trains over ROS', 'torchrun',
+                        'name several robots with --namespaces instead')
+    config, world = train_config(args), world_options(args)
+    robot = (load_robot(args.robot) if args.robot else RobotSpec()).with_actions(
+        args.actions.split(','))
+    bags = _bag_mix(args, config, robot)  # no robot waits for the decoding
+    with RosEnv(robot, args.size,
+                namespaces=args.namespaces or ('',), lock_step=args.lock_step,
+                max_decisions=world['max_decisions'], collision_reward=world['collision_reward'],
+                record=args.record, ros_arguments=args.ros_args or ()) as env:
+        config, words = config_over_ros(config, world, env.offers, args.lock_step)
+        for line in words:
+            print(line, flush=True)
+        env.listen(config.privileged)
+        info = _info(args, config, env, bags) | {
+            'houses': [env.scene['house']] if 'house' in env.scene else [],
+            'rooms': env.scene.get('rooms')}
+
+        def say(row: dict) -> None:
+            print(f'{row["frames"]:,} frames: {env.steps / env.seconds:.2f} steps/s over ROS, '
+                  f'{row["fps"]:.2f} with learning', flush=True)
+        print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
+                    bags=bags, on_update=say))
+    return 0
+
+
+def _pair_sources(args: argparse.Namespace, config):
+    """Makes the pairs that a training begins with, and those of validation houses."""
+    def make():
+        from vn_nav.robot import load_robot
+        from vn_sim_bridge.datasets.house_pairs import PairSampler
+        from vn_sim_bridge.houses.splits import SPLITS
+        from vn_sim_bridge.render.randomisation import load_randomisation
+        options = {'rooms': args.rooms, 'size': args.size, 'threads': config.threads,
+                   'robot': load_robot(args.robot) if args.robot else None,
+                   'randomisation': load_randomisation(args.randomisation)}
+        return (PairSampler(SPLITS['train'][:config.pair_houses], seed=args.seed, **options),
+                PairSampler(SPLITS['validation'][:16], seed=args.seed + 1, **options))
+    return make

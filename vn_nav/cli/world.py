@@ -51,6 +51,28 @@ def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, thread
     return WarpNavigationEnv(config, spec, device=device)
 
 
+def make_env_for(checkpoint, houses, rooms: int, envs: int, *, stop: str, own: bool,
+                 robot: Path | None = None, randomisation: str | None = None,
+                 max_decisions: int = 300, goal_seed: int = 0):
+    """A `NavigationEnv` in which a checkpoint is measured, on its own task.
+
+    Args:
+        checkpoint: the policy.
+        houses, rooms, envs, robot: see `make_env`.
+        stop: what ends an episode before its limit, 'arrival' or 'declared'.
+        own: the houses are those that it was trained in, with as many goals.
+        randomisation: None: that of the training.
+        max_decisions: of an episode.
+        goal_seed: 0 for the goals of the training.
+    """
+    info = checkpoint.info
+    return make_env(houses, rooms, envs, robot=robot, size=checkpoint.config.size,
+                    randomisation=randomisation or info['randomisation'], task=info['task'],
+                    objects=info['objects'], actions=checkpoint.config.actions,
+                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
+                    goals_per_room=info['goals_per_room'] if own else 1)
+
+
 def _check_gpu(device: str) -> None:
     """Whether the simulator can run on a GPU such as cuda:0."""
     import torch

@@ -14,7 +14,7 @@ import numpy as np
 
 from vn_nav.arrival import arrived, heading_error
 from vn_nav.bags.drive import MISFIT
-from vn_nav.co_visibility import lift, overlap, overlap_by_poses, relative_pose
+from vn_nav.co_visibility import co_visible, co_visible_by_poses, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.learning.auxiliary import MAX_DEPTH
 from vn_nav.robot import RobotSpec
@@ -116,32 +116,32 @@ class Drives:
         return Labels(relative_pose(pose, goal_pose), arrived(gap, turn),
                       self._driven(rows, goals).astype(np.float32))
 
-    def overlap(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    def co_visibility(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Share of what the goals' pictures show that the rows' show too, [K] float32; -1 unknown.
 
-        Measured as the simulator does where the bag has depth, else `overlap_by_odometry`.
+        Measured as the simulator does where the bag has depth, else `co_visibility_by_odometry`.
         """
-        shown = self.overlap_by_odometry(rows, goals)
+        shown = self.co_visibility_by_odometry(rows, goals)
         measured = self.has['depth'][rows] & self.has['depth'][goals]
         if measured.any():
-            shown[measured] = self._overlap_by_depth(rows[measured], goals[measured])
+            shown[measured] = self._co_visibility_by_depth(rows[measured], goals[measured])
         return shown
 
-    def overlap_by_odometry(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """What the poses and the metres driven say, see `overlap.overlap_by_poses`."""
+    def co_visibility_by_odometry(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """What the poses and the metres driven say, see `co_visibility.co_visible_by_poses`."""
         pose = relative_pose(self.pose[rows], self.pose[goals])
-        return overlap_by_poses(pose, self._driven(rows, goals), self.robot.camera_fov)
+        return co_visible_by_poses(pose, self._driven(rows, goals), self.robot.camera_fov)
 
     def _driven(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
         return np.abs(self._along[goals] - self._along[rows])
 
-    def _overlap_by_depth(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    def _co_visibility_by_depth(self, rows: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """As the simulator measures it, with the depth pictures of the bag."""
         own, index = np.unique(goals, return_inverse=True)
         depth = self._metres(own)
         depth[depth >= MAX_DEPTH] = 0.0  # somewhere beyond
         points = lift(depth, *self._cameras(own))[index]
-        return overlap(points, self._metres(rows), *self._cameras(rows))
+        return co_visible(points, self._metres(rows), *self._cameras(rows))
 
     def _metres(self, rows: np.ndarray) -> np.ndarray:
         stored = self.pictures('depth', rows)

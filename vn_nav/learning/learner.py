@@ -7,7 +7,6 @@ probabilities is 1 and its gradient that of the log-probability (Huang et al., a
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -16,127 +15,15 @@ import torch
 from torch import Tensor
 
 from vn_nav.errors import UserError
-from vn_nav.files import write_file
 from vn_nav.learning import auxiliary
+from vn_nav.learning.batches import acting_rows, few_goals_of, own_frames, select
 from vn_nav.learning.distributed import Processes
+from vn_nav.learning.failed_batch import give_up
+from vn_nav.learning.learner_config import TEACHERS, LearnerConfig
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.returns import generalised_advantages, masked_mean
 from vn_nav.learning.rollout import Rollout
-from vn_nav.observation import Observation
-from vn_nav.policy.network import IMAGE_HEADS, Policy, RecurrentState
-
-# Tasks whose weight is a field of `LearnerConfig`. The first three learn from the replay memory.
-REPLAY_TASKS = ('pixel_control', 'value_replay', 'reward_prediction')
-TASKS = (*REPLAY_TASKS, *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance', 'imitation')
-HEADLESS = ('value_replay', 'imitation')  # they learn through critic and actor
-# What the environment has to tell beside the observation, by task.
-PRIVILEGED = {'depth': ('depth',), 'segmentation': ('segmentation',),
-              'goal_segmentation': ('goal_segmentation',), 'goal_pose': ('goal_pose', 'overlap'),
-              'arrival': ('arrived',), 'distance': ('distance',)}
-# What each teacher tells, and the action by which it drives.
-TEACHERS = {'explorer': ('explorer_action',), 'oracle': ('oracle_action',),
-            'routes': ('oracle_action', 'oracle_regret')}
-
-
-@dataclasses.dataclass(frozen=True)
-class LearnerConfig:
-    """Numbers of one update. A weight of 0 switches an auxiliary task off."""
-
-    optimiser: str = 'adam'  # or 'rmsprop' (alpha 0.99)
-    rmsprop_epsilon: float = 1e-5
-    learning_rate: float = 4e-4  # at the start
-    final_learning_rate: float = 4e-5
-    gamma: float = 0.99  # discount
-    lam: float = 0.95  # of the advantage estimator
-    clip: float | None = 0.2  # None: no clipping
-    epochs: int = 3
-    minibatches: int = 8  # by environments: sequences stay whole
-    normalise_advantage: bool = True
-    truncation_is_terminal: bool = False  # the published code's treatment of time-outs
-    value_coefficient: float = 0.5
-    entropy_coefficient: float = 0.01  # at the start
-    final_entropy_coefficient: float = 0.005
-    max_gradient_norm: float = 0.5
-    # Weights of the auxiliary tasks (thesis, table 5.1; the last five are ours).
-    pixel_control: float = 0.0
-    value_replay: float = 0.0
-    reward_prediction: float = 0.0
-    depth: float = 0.0
-    segmentation: float = 0.0
-    goal_segmentation: float = 0.0
-    reconstruction: float = 0.0
-    goal_pose: float = 0.0
-    arrival: float = 0.0
-    distance: float = 0.0
-    imitation: float = 0.0  # at the start
-    # Whole episodes are driven by the teacher, so that the policy is shown where it should be: a
-    # share of them at the start, falling to none.
-    teacher_share: float = 0.0
-    teacher_until: float = 0.5  # share of the training at which it has fallen to 0
-    imitation_until: float = 0.7  # share of the training at which it has fallen to 0
-    # Whom to imitate: one that knows what the robot has seen, or the shortest path, which only a
-    # policy that knows the house by heart can follow: its actions, or (routes) what each action
-    # loses, where the simulator knows that.
-    teacher: str = 'explorer'
-    # The replay memory, used by `REPLAY_TASKS`, and by the image heads if `images_from_replay`.
-    images_from_replay: bool = True
-    replay_steps: int = 32_000  # of all environments together
-    replay_batch: int = 16  # sequences that each task draws for an update
-    replay_length: int = 20  # steps of a sequence
-    pixel_control_gamma: float = 0.9
-    pixel_change_grey: bool = True  # thesis; False: the published code's RGB
-    unrewarded: float = 1 / 3  # share of reward prediction's samples
-
-    def __post_init__(self):
-        positive = ('learning_rate', 'final_learning_rate', 'max_gradient_norm', 'epochs',
-                    'minibatches', 'replay_steps', 'replay_batch', 'replay_length',
-                    'rmsprop_epsilon', 'imitation_until', 'teacher_until')
-        for name in positive:
-            value = getattr(self, name)
-            if not value > 0 and not (name == 'final_learning_rate' and value == 0):
-                raise UserError(f'{name} is positive', value, 'correct it')
-        if self.clip is not None and not self.clip > 0:
-            raise UserError('clip is positive, or None', self.clip, 'correct it')
-        for name in ('gamma', 'lam', 'pixel_control_gamma', 'unrewarded', 'imitation_until',
-                     'teacher_share', 'teacher_until'):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UserError(f'{name} lies in [0, 1]', getattr(self, name), 'correct it')
-        for name in TASKS:
-            if not getattr(self, name) >= 0:
-                raise UserError(f'the weight {name} is not negative', getattr(self, name),
-                                'correct it')
-        if self.teacher_share and not self.imitation:
-            raise UserError('a teacher drives episodes for the task imitation',
-                            f'teacher_share {self.teacher_share:g} with imitation 0',
-                            'set teacher_share to 0, or give imitation a weight')
-        if self.teacher not in TEACHERS:
-            raise UserError(f'the teacher is one of {", ".join(TEACHERS)}', self.teacher,
-                            'choose one')
-        if self.optimiser not in ('adam', 'rmsprop'):
-            raise UserError('the optimiser is adam or rmsprop', self.optimiser, 'choose one')
-
-    @property
-    def tasks(self) -> tuple[str, ...]:
-        """The auxiliary tasks that are on."""
-        return tuple(name for name in TASKS if getattr(self, name) > 0)
-
-    @property
-    def heads(self) -> tuple[str, ...]:
-        """The heads that the network needs for them."""
-        return tuple(name for name in self.tasks if name not in HEADLESS)
-
-    @property
-    def privileged(self) -> tuple[str, ...]:
-        """What batches must hold beside the observations."""
-        keys = [key for name in self.tasks for key in PRIVILEGED.get(name, ())]
-        return tuple(keys) + (TEACHERS[self.teacher] if self.imitation else ())
-
-    @property
-    def from_replay(self) -> tuple[str, ...]:
-        """The tasks that learn from the replay memory."""
-        return tuple(name for name in self.tasks if name in REPLAY_TASKS
-                     or (name in IMAGE_HEADS and self.images_from_replay))
-
+from vn_nav.policy.network import IMAGE_HEADS, Policy
 
 Losses = dict[str, float]  # means over the steps of one update
 BASIC_LOSSES = ('policy_loss', 'value_loss', 'entropy', 'kl', 'clipped', 'gradient_norm')
@@ -225,7 +112,7 @@ class Learner:
         totals, updates = torch.zeros(len(names), device=rollout.action.device), 0
         environments = rollout.action.shape[1]
         if not self.prompt:
-            rollout = dataclasses.replace(rollout, observation=_few_goals(rollout.observation))
+            rollout = dataclasses.replace(rollout, observation=few_goals_of(rollout.observation))
         for _ in range(config.epochs):
             order = torch.randperm(environments, generator=self.generator,
                                    device=self.generator.device)
@@ -236,8 +123,8 @@ class Learner:
                 updates += 1
         losses = dict(zip(names, (totals / updates).tolist(), strict=True))
         if not self.prompt and not all(map(math.isfinite, losses.values())):
-            self._give_up(rollout, advantage, target, dict(zip(names, totals / updates,
-                                                               strict=True)))
+            self._give_up(rollout, advantage, target,
+                          dict(zip(names, totals / updates, strict=True)))
         return losses
 
     def _step(self, batch: Rollout, advantage: Tensor, target: Tensor,
@@ -262,7 +149,8 @@ class Learner:
               entropy_coefficient: float) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted sum of all losses, and by name what there is to say of them."""
         config, valid = self.config, own_frames(batch)
-        latents, _ = self.network.latents(_rows(batch.observation), batch.starts[:-1], batch.state)
+        latents, _ = self.network.latents(acting_rows(batch.observation), batch.starts[:-1],
+                                          batch.state)
         output = self.network.read(latents)
         logits = output.logits
         if batch.filter_offsets is not None:  # the actions were chosen behind the action filter
@@ -320,7 +208,7 @@ class Learner:
             return {}
         window = self.replay.windows(config.replay_batch, config.replay_length, self.generator)
         self._drawn |= dict.fromkeys(names, window)
-        maps = network.maps(_rows(window.observation), window.starts[:-1])
+        maps = network.maps(acting_rows(window.observation), window.starts[:-1])
         return {name: auxiliary.image_loss(network, name, maps, window) for name in names}
 
     def _replayed_loss(self, name: str) -> Tensor:
@@ -344,88 +232,7 @@ class Learner:
 
     def _give_up(self, batch: Rollout, advantage: Tensor, target: Tensor,
                  figures: dict[str, Tensor]) -> None:
-        """Leave what the step was computed from, and end the training.
-
-        `torch.load(path)` gives plain values and tensors: `batch` (the fields of `Rollout`, one
-        minibatch), `advantage` and `target` [T,B] as the losses used them, `losses` by name,
-        `replayed` (what was drawn for each task whose loss is not finite) and the `network`'s
-        weights before the step.
-        """
-        where = ''
-        if self.failed_batch is not None:
-            drawn = {name: part for name, part in self._drawn.items()
-                     if not torch.isfinite(figures[name])}
-            buffer = io.BytesIO()
-            torch.save({
-                'batch': _plain(batch), 'advantage': advantage, 'target': target,
-                'losses': {name.removesuffix('_loss'): float(value)
-                           for name, value in figures.items()},
-                'replayed': {name: _plain(part) for name, part in drawn.items()},
-                'network': self.network.state_dict()}, buffer)
-            try:
-                self.failed_batch.parent.mkdir(parents=True, exist_ok=True)
-                write_file(self.failed_batch, buffer.getvalue())
-                where = f'; the batch is in {self.failed_batch} (torch.load reads it)'
-            except OSError as error:
-                where = f'; the batch could not be written to {error.filename}: {error.strerror}'
-        raise UserError('losses and gradients stay finite',
-                        ', '.join(f'{name} {float(value):g}' for name, value in figures.items()),
-                        f'lower the learning rate and resume from the last checkpoint{where}')
-
-
-def _plain(part: Rollout | dict) -> dict:
-    """As a dictionary that `torch.load` trusts, and the network's goals once."""
-    if isinstance(part, dict):
-        return part
-    rows = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
-    state = None if part.state is None else part.state._asdict()
-    return {**rows, 'observation': part.observation._asdict(), 'state': state}
-
-
-def select(rollout: Rollout, columns: Tensor, few_goals: bool = True) -> Rollout:
-    """Some environments of a rollout, with only the goals that occur in them, or with all.
-
-    Pictures stay channels last in memory. To find the goals, the host waits for the device.
-    """
-    seen = rollout.observation
-    # index_select copies whole pictures; plain indexing takes ten times as long.
-    image = seen.image.permute(0, 1, 3, 4, 2).index_select(1, columns).permute(0, 1, 4, 2, 3)
-    extras = seen.extras and {key: rows[:, columns] for key, rows in seen.extras.items()}
-    observation = Observation(image, seen.goals, seen.goal_index[:, columns],
-                              seen.last_action[:, columns], seen.last_reward[:, columns], extras)
-    if few_goals:
-        observation = _few_goals(observation)
-
-    def part(rows: Tensor | None) -> Tensor | None:
-        return None if rows is None else rows[:, columns]
-    return Rollout(
-        observation, *(part(getattr(rollout, name)) for name in (
-            'starts', 'action', 'reward', 'terminated', 'truncated', 'valid')),
-        state=(None if rollout.state is None
-               else RecurrentState(*(rows[columns] for rows in rollout.state))),
-        privileged={key: part(rows) for key, rows in rollout.privileged.items()},
-        driven=part(rollout.driven),
-        log_probability=part(rollout.log_probability), value=part(rollout.value),
-        filter_offsets=part(rollout.filter_offsets))
-
-
-def _few_goals(observation: Observation) -> Observation:
-    """With only the goals that occur in it."""
-    used, index = torch.unique(observation.goal_index, return_inverse=True)
-    return observation._replace(goals=observation.goals[used], goal_index=index)
-
-
-def own_frames(rollout: Rollout) -> Tensor:
-    """[T,B] frames in which the policy itself acted."""
-    return rollout.valid if rollout.driven is None else rollout.valid & ~rollout.driven
-
-
-def _rows(observation: Observation) -> Observation:
-    """All rows but the last, which only bootstraps."""
-    extras = observation.extras
-    return Observation(observation.image[:-1], observation.goals,
-                       *(rows[:-1] for rows in observation[2:5]),
-                       extras and {key: rows[:-1] for key, rows in extras.items()})
+        give_up(self.failed_batch, self.network, batch, advantage, target, figures, self._drawn)
 
 
 def _linear(first: float, last: float, progress: float) -> float:

@@ -146,7 +146,7 @@ def errors(pose: Pose, pairs: dict[str, np.ndarray]) -> dict[str, float]:
     true_position, true_heading = truth[sees, :2], truth[sees, 2:]
     far = true_position.norm(dim=1) > 0.3  # nearer, a bearing means nothing
     bearing = _angle(position, true_position)[far]
-    correct = (pose.overlap.detach() > 0) == sees
+    correct = (pose.co_visible.detach() > 0) == sees
     return {
         'bearing_deg': _median(bearing), 'bearing_within_30': _mean(bearing <= 30),
         'heading_deg': _median(_angle(heading, true_heading)),

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import softened
 from vn_nav.policy.network import Policy
-from vn_nav.policy.places import PlaceRecogniser, Routes, heading_cells
+from vn_nav.policy.places import PlaceClassifier, Routes, heading_cells
 
 BATCH = 128  # pictures
 LEARNING_RATE = 1e-3  # of Adam, at the start; falls to a twentieth
@@ -139,7 +139,7 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
     return {'regret': lost, 'ways': seen}
 
 
-def _places(network: Policy) -> PlaceRecogniser:
+def _places(network: Policy) -> PlaceClassifier:
     assert network.places is not None  # the network was made for a place
     return network.places
 

@@ -23,7 +23,7 @@ import re
 import typing
 
 from vn_nav.errors import UserError
-from vn_nav.learning.learner import LearnerConfig
+from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.encoders import LARGE
 from vn_nav.policy.network import NetworkConfig
@@ -207,7 +207,7 @@ ENVIRONMENT: dict[str, dict] = {
 }
 
 
-def preset(name: str, **changes) -> TrainConfig:
+def preset(name: str, /, **changes) -> TrainConfig:
     """The configuration of a preset with some numbers changed.
 
     Raises:

@@ -13,22 +13,18 @@ where it grows by one, which is all that drawing needs to know about episodes.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
-import os
-import uuid
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from vn_nav.errors import UserError
+from vn_nav.learning.replay_files import RingFiles
 from vn_nav.learning.rollout import Rollout
 from vn_nav.observation import Observation
 
 PICTURES = ('depth', 'segmentation')  # what may be kept beside the observation, [S,S] uint8
-HEADER = 'replay.json'
 LAYOUT = 1  # of the files
 
 
@@ -83,19 +79,18 @@ class Replay:
         self.capacity, self.num_envs, self.size = capacity, num_envs, size
         self.goals, self.goal_segmentation = goals, goal_segmentation
         self.privileged, self.max_depth = tuple(privileged), max_depth
-        self.directory = None if directory is None else Path(directory)
         self.device = torch.device(device)
         self.resumed: str | None = None
         self.total = self.count = 0  # rows ever appended; readable ones, the newest of them
-        self.identity = ''  # of the training that the rings belong to
         self._steps: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
-        self._maps: list[np.memmap] = []
         layout = self._layout(capacity, num_envs, size, self.privileged)
-        if self.directory is None:
+        self._files = (None if directory is None
+                       else RingFiles(Path(directory), self._header()))
+        if self._files is None:
             self.rings = {name: torch.zeros(shape, dtype=dtype, device=self.device)
                           for name, (dtype, shape) in layout.items()}
         else:
-            self.rings = self._map_files(layout)
+            self.rings = self._files.open(layout)
 
     @staticmethod
     def _layout(capacity: int, num_envs: int, size: int, privileged: tuple[str, ...]
@@ -165,7 +160,7 @@ class Replay:
         if 'depth' in rows:
             rows['depth'] = encode_depth(rows['depth'][:steps], self.max_depth)
         if not self.total:
-            self._begin_files()
+            self._take_over()
         serial = torch.arange(self.total, self.total + steps, device=self.device)
         # The serial last: a process killed in between leaves rows that nobody trusts.
         self._write('serial', torch.full_like(serial, -1))
@@ -340,7 +335,7 @@ class Replay:
             return
         if state['identity'] != self.identity:
             raise UserError('a training goes on with its own replay files',
-                            f'files of {self.identity} in {self.directory}',
+                            f'files of {self.identity} in {self._files.directory}',
                             'remove that folder: the memory is then filled anew')
         newest_first = torch.arange(state['total'] - 1, state['total'] - 1 - state['count'], -1)
         kept = self.rings['serial'][newest_first % self.capacity] == newest_first
@@ -348,10 +343,15 @@ class Replay:
         if count:
             self.total, self.count, self.resumed = state['total'], count, 'mapped'
 
+    @property
+    def identity(self) -> str:
+        """Of the training that the rings belong to; empty: they are in no files."""
+        return '' if self._files is None else self._files.identity
+
     def flush(self) -> None:
         """Write the mapped files to the disk."""
-        for ring in self._maps:
-            ring.flush()
+        if self._files is not None:
+            self._files.flush()
 
     def _header(self) -> dict:
         digest = hashlib.sha256()
@@ -362,56 +362,7 @@ class Replay:
                 'size': self.size, 'privileged': list(self.privileged),
                 'max_depth': self.max_depth, 'goals': digest.hexdigest()}
 
-    def _map_files(self, layout: dict) -> dict[str, Tensor]:
-        """Open the files that are there, or make them."""
-        header, path = self._header(), self.directory / HEADER
-        sizes = {name: math.prod(shape) * dtype.itemsize
-                 for name, (dtype, shape) in layout.items()}
-        if path.exists():
-            try:
-                found = json.loads(path.read_text())
-                self.identity = found.pop('identity')
-            except (ValueError, KeyError, TypeError, AttributeError):
-                found = {}
-            wrong = sorted(key for key in header if found.get(key) != header[key])
-            wrong += sorted(name for name, size in sizes.items()
-                            if not self._file(name).exists()
-                            or self._file(name).stat().st_size != size)
-            if wrong:
-                raise UserError('replay files fit the memory that opens them',
-                                f'{path.parent}: {", ".join(wrong)} differ',
-                                'remove that folder: the memory is then filled anew')
-        else:
-            self.directory.mkdir(parents=True, exist_ok=True)
-            for name, size in sizes.items():
-                self._allocate(self._file(name), size)
-        rings = {}
-        for name, (dtype, shape) in layout.items():
-            kind = torch.empty(0, dtype=dtype).numpy().dtype
-            self._maps.append(np.memmap(self._file(name), kind, 'r+', shape=shape))
-            rings[name] = torch.from_numpy(self._maps[-1])
-        return rings
-
-    def _file(self, name: str) -> Path:
-        return self.directory / f'{name}.ring'
-
-    def _allocate(self, path: Path, size: int) -> None:
-        """Make a file whose blocks are there: a full disk must show here, not as a bus error."""
-        try:
-            with path.open('wb') as file:
-                os.posix_fallocate(file.fileno(), 0, size)
-        except OSError as error:
-            raise UserError(f'the replay files find {size / 1e9:.2f} GB on the disk',
-                            f'{path}: {error.strerror}',
-                            'free the space, or keep fewer steps') from error
-
-    def _begin_files(self) -> None:
-        """A new training takes the files over: from here on no older checkpoint fits them."""
+    def _take_over(self) -> None:
         self.rings['serial'].fill_(-1)
-        if self.directory is None:
-            return
-        self.identity = uuid.uuid4().hex
-        path = self.directory / HEADER
-        part = path.with_suffix('.part')
-        part.write_text(json.dumps({**self._header(), 'identity': self.identity}, indent=1))
-        os.replace(part, path)
+        if self._files is not None:
+            self._files.take_over()

@@ -33,7 +33,7 @@ class Guess(NamedTuple):
 
     action: int | None  # the most frequent one; None: there is none
     goal_pose: np.ndarray  # [4] the mean of pairs that overlap
-    overlap: bool  # whether most pairs do
+    co_visible: bool  # whether most pairs do
 
 
 class Batch(NamedTuple):
@@ -69,7 +69,7 @@ class Tally:
     def add_poses(self, said: Pose, goal_pose: Tensor, overlap: Tensor) -> None:
         """Keep K poses and their labels."""
         self._poses.append(torch.cat([
-            said.position.detach(), said.heading.detach(), said.overlap.detach()[:, None],
+            said.position.detach(), said.heading.detach(), said.co_visible.detach()[:, None],
             goal_pose, overlap[:, None]], dim=1).cpu())
 
     def figures(self, weight: Callable[[str], float]) -> dict[str, float]:
@@ -96,7 +96,7 @@ class Tally:
             table = torch.cat(self._poses)
             table = table[table[:, 9] >= 0]
             said = torch.from_numpy(guess.goal_pose).float().expand(len(table), 4)
-            sign = torch.full((len(table),), 1.0 if guess.overlap else -1.0)
+            sign = torch.full((len(table),), 1.0 if guess.co_visible else -1.0)
             row |= pairs.errors(Pose(said[:, :2], said[:, 2:], sign), {
                 'goal_pose': table[:, 5:9].numpy(), 'overlap': table[:, 9].numpy()})
         return row
@@ -157,7 +157,8 @@ class Objective:
 
     def guess(self, rows: np.ndarray, goals: np.ndarray, action: np.ndarray) -> Guess:
         """The best guess by pairs [K] and by actions [M] to learn from, negative where none is."""
-        poses, shown = self.drives.label(rows, goals).goal_pose, self.drives.overlap(rows, goals)
+        poses = self.drives.label(rows, goals).goal_pose
+        shown = self.drives.co_visibility(rows, goals)
         sees, known = shown >= POSE_OVERLAP, shown >= 0
         mean = poses[sees if sees.any() else slice(None)].mean(axis=0)
         counts = np.bincount(action[action >= 0])
@@ -231,7 +232,7 @@ class Objective:
         said = Pose(*(torch.cat(part) for part in zip(*(p for p, *_ in poses), strict=True)))
         rows, goals = (np.concatenate([entry[k] for entry in poses]) for k in (1, 2))
         truth = self._tensor(self.drives.label(rows, goals).goal_pose)
-        overlap = self._tensor(self.drives.overlap(rows, goals))
+        overlap = self._tensor(self.drives.co_visibility(rows, goals))
         known = overlap >= 0
         loss = pose_loss(*said, truth, overlap, known)
         tally.add('goal_pose', loss, int(known.sum()))

@@ -19,6 +19,7 @@ from vn_nav.report import tables
 from vn_nav.report.evaluation_page import evaluation_page
 from vn_nav.robot import RobotSpec
 
+DRIVE_SPLITS = ('seen_goals', 'unseen_goals')  # goals that are learned, and those held out
 BEFORE = 'before teaching'
 DECODING = 'sample'
 RIGHT = f'right goal, {DECODING}'

@@ -21,7 +21,8 @@ from rclpy.signals import SignalHandlerOptions
 from vn_nav.bags.drive import RECORDED
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.nodes.process import Ended
-from vn_nav.nodes.ros_robot import BESIDE, RosRobot, Seen
+from vn_nav.nodes.robot_senses import BESIDE, Seen
+from vn_nav.nodes.ros_robot import RosRobot
 from vn_nav.reset_arguments import read_options
 from vn_nav.robot import RobotSpec
 

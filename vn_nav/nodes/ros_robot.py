@@ -8,42 +8,31 @@ policy_node; but nobody has to enable it again: it goes on by itself when the ca
 
 from __future__ import annotations
 
-import collections
-import dataclasses
-import hashlib
 import json
-import math
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Bool, Float32, Int8, String, UInt8
+from std_msgs.msg import Int8, String
 from std_srvs.srv import Trigger
 
-from vn_msgs_py import images
-from vn_msgs_py.topics import VOLATILE, topic
-from vn_nav.bags.stamped import WINDOW
-from vn_nav.bags.storage.writer import BagWriter, RecordingStopped
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.process import Ended
-from vn_nav.nodes.qos import profile, qos, subscribe
+from vn_nav.nodes.qos import qos
+from vn_nav.nodes.recorded_topics import RecordedTopics
+from vn_nav.nodes.robot_senses import Seen, Senses, Tally
 from vn_nav.nodes.work_threads import WorkThreads
-from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
-from vn_nav.policy.frame_gate import shorten
-from vn_nav.policy.goal_watch import GoalWatch
+from vn_nav.observation import crop_fraction
 from vn_nav.policy.navigator import ENABLED, STOP_SECONDS, Limits, Navigator, State
 from vn_nav.robot import RobotSpec
 
@@ -58,16 +47,6 @@ LOOK = 0.05  # s between looks for a signal
 QUIET = 1.0  # s of waiting about which nothing is said
 WATCH = 0.25  # s between looks for other publishers
 TERMINATED, TRUNCATED = 1, 2  # on `episode_end`
-# Beside the picture, by the key of `info`: topic and decoder.
-BESIDE = {'depth': ('depth/image_raw', images.decode_depth),
-          'segmentation': ('labels/image_raw', images.decode_labels)}
-
-
-class Seen(NamedTuple):
-    """What the robot sees at rest."""
-
-    picture: np.ndarray  # [3,S,S] uint8
-    beside: dict[str, np.ndarray]  # [S,S] depth [m], 0 where unknown; segmentation class ids
 
 
 class Outcome(NamedTuple):
@@ -83,17 +62,6 @@ class Outcome(NamedTuple):
     stale: bool
 
 
-@dataclasses.dataclass
-class Tally:
-    """What was said on topics since the last decision."""
-
-    reward: float = 0.0
-    judged: bool = False  # somebody said something on `reward`
-    collided: bool = False
-    arrived: bool = False
-    end: int = 0
-
-
 class RosRobot(Node):
     """A robot that a training drives.
 
@@ -106,10 +74,6 @@ class RosRobot(Node):
         max_decisions: of an episode, where nobody publishes `episode_end`.
         ended: a signal has come.
         bag: folder to record into; None: nowhere.
-
-    Attributes:
-        goal: the goal picture in force [3,S,S].
-        scene: what a simulator says of itself; empty: nobody does.
     """
 
     def __init__(self, context: Context, namespace: str, robot: RobotSpec, size: int, *,
@@ -131,199 +95,46 @@ class RosRobot(Node):
         self.output = CommandOutput(
             self, self.navigator, self.wake, period=1.0 / value['control_rate'],
             lock_step=lock_step, stamped=value['enable_stamped_cmd_vel'])
-        self._goal_watch = GoalWatch(trust_stamps=lock_step)
-        self.camera_fov: float | None = None
-        self.goal: np.ndarray | None = None
-        self.scene: dict = {}
+        self._topics = RecordedTopics(self, bag)
+        self._senses = Senses(
+            self, self._topics, self.navigator, self.output, self.wake, robot, size,
+            lock_step=lock_step, compressed=value['image_transport'] == 'compressed')
         self.failure: str = ''  # of a thread
         self._held = False
         self._threads: WorkThreads | None = None
-        self._goals = 0  # that were taken
-        self._frame: tuple[float, np.ndarray] | None = None  # the newest, of the present goal
-        self._beside: dict[str, collections.deque] = {}  # (stamp, message) by key
-        self._tally = Tally()
         self._shown: Seen | None = None
         self._episode_goal = 0  # number of the goal that the episode began with
         self._awaits_goal = False
         self._decisions = self._cut_before = 0
         self._stopped_since: float | None = None
-        self._writer = BagWriter(bag) if bag is not None else None
-        self._make_interfaces(value['image_transport'] == 'compressed')
+        self._make_interfaces()
 
-    # Interfaces. Outcomes come first: of what has arrived, the executor serves the oldest
-    # subscription first, and so the outcome of a decision before the picture that follows it.
-
-    def _make_interfaces(self, compressed: bool) -> None:
-        self._hear(Float32, 'reward', self._on_reward, history=False)
-        self._hear(Bool, 'collision', self._on_collision, history=False)
-        self._hear(Bool, 'arrived', self._on_arrived, history=False)
-        self._hear(UInt8, 'episode_end', self._on_episode_end, history=False)
-        self._hear(String, 'scene', self._on_scene)
-        self._hear(Image, 'goal_image', self._on_goal, anybody=True)
-        # In lock-step no odometry may be missed, and the simulator is reliable.
-        self._hear(Odometry, 'odom', self.output.take_odometry, anybody=not self.lock_step)
-        self._hear(CameraInfo, 'camera_info', self._on_camera_info)
-        self._hear(*((CompressedImage, 'image_raw/compressed') if compressed else
-                     (Image, 'image_raw')), self._on_image)
+    def _make_interfaces(self) -> None:
         self._action, names = (self.create_publisher(kind, name, qos(name)) for kind, name in (
             (Int8, 'action'), (String, 'action_names')))
-        self._say(names, 'action_names', String(data=json.dumps(self.robot.action_names)))
-        if self._writer is not None:  # what this node publishes itself, as everybody hears it
-            entry = topic('cmd_vel')
-            kind = self.output.publisher.msg_type
-            self._writer.add(dataclasses.replace(
-                entry, type=f'geometry_msgs/msg/{kind.__name__}'))
-            self.create_subscription(kind, 'cmd_vel', self._recording('cmd_vel'), qos('cmd_vel'))
+        self._topics.say(names, 'action_names', String(data=json.dumps(self.robot.action_names)))
+        self._topics.record_own(self.output.publisher, 'cmd_vel')
         self.create_service(Trigger, '~/stop', self._on_stop)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_timer(WATCH, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _hear(self, kind: type, name: str, handle: Callable[[Any], None], *,
-              history: bool = True, anybody: bool = False) -> None:
-        """Subscribe to a topic of the contract.
-
-        Args:
-            kind: of the messages.
-            name: of the topic.
-            handle: called with each.
-            history: also what was said before, where the topic keeps it.
-            anybody: hear any publisher, whatever its quality of service.
-        """
-        entry = topic(name)
-        record = self._recording(name)
-        if self._writer is not None:
-            self._writer.add(entry)
-
-        last = None
-
-        def callback(message, info) -> None:
-            nonlocal last
-            this = (info['source_timestamp'], info.get('publication_sequence_number'))
-            if anybody and this == last:  # heard by another subscription of the topic
-                return
-            last = this
-            record(message, info)
-            handle(message)
-        if anybody:
-            subscribe(self, kind, name, callback)
-        else:
-            self.create_subscription(kind, name, callback, profile(
-                entry if history else dataclasses.replace(entry, durability=VOLATILE)))
-
-    def _recording(self, name: str) -> Callable[[Any, dict], None]:
-        def record(message, info) -> None:
-            self._record(name, message, info['source_timestamp'],
-                         info.get('publication_sequence_number') or 0)
-        return record
-
-    def _record(self, name: str, message: Any, stamp: int = 0, number: int = 0) -> None:
-        """Into the bag, if there is one; a disk that is full ends the recording alone."""
-        if self._writer is None:
-            return
-        try:
-            self._writer.write(name, serialize_message(message), stamp or time.time_ns(),
-                               number)
-        except RecordingStopped as error:
-            self._writer = None
-            self.get_logger().error(f'recording stopped: {error}')
-
-    def _say(self, publisher, name: str, message: Any) -> None:
-        publisher.publish(message)
-        if self._writer is not None:
-            self._writer.add(topic(name))
-        self._record(name, message)
-
     def listen(self, keys: tuple[str, ...]) -> None:
         """Have these keys of `BESIDE` beside every picture."""
-        for key in keys:
-            self._beside[key] = collections.deque(maxlen=16)
-
-            def keep(message, rows=self._beside[key]) -> None:
-                with self.wake:
-                    rows.append((_seconds(message.header.stamp), message))
-                    self.wake.notify_all()
-            self._hear(Image, BESIDE[key][0], keep)
+        self._senses.listen(keys)
 
     def offers(self) -> set[str]:
         """The keys of `BESIDE` that somebody publishes."""
-        return {key for key, (name, _) in BESIDE.items() if self.count_publishers(name)}
+        return self._senses.offers()
 
-    # Callbacks, on the executor's thread.
+    @property
+    def goal(self) -> np.ndarray | None:
+        """The goal picture in force [3,S,S]."""
+        return self._senses.goal
 
-    def _on_image(self, message) -> None:
-        received = time.monotonic()
-        stamp = _seconds(message.header.stamp)
-        with self.wake:
-            # In lock-step stamps are the simulator's ticks and nothing is late.
-            if not self.navigator.admit(stamp, None if self.lock_step else self._now()):
-                return
-        try:
-            picture = self._prepare(message)
-        except Exception as error:  # whatever is wrong with it: as good as no picture
-            with self.wake:
-                self.navigator.bad_frame(str(error) or repr(error), time.monotonic())
-                self.wake.notify_all()
-            return
-        with self.wake:
-            self.navigator.good_frame(received)
-            self._frame = (stamp, picture)
-            self.wake.notify_all()
-
-    def _on_goal(self, message: Image) -> None:
-        stamp = message.header.stamp
-        content = hashlib.blake2b(message.data, digest_size=16).digest()
-        with self.wake:
-            if not self._goal_watch.is_new((stamp.sec, stamp.nanosec), content, time.monotonic()):
-                return
-            self.navigator.new_goal()
-        try:
-            picture = self._prepare(message)
-        except Exception as error:  # whatever is wrong with it: a picture moves no robot
-            self.get_logger().error(f'goal_image refused: {shorten(str(error))}')
-            with self.wake:
-                self.navigator.refuse_goal(str(error))
-            return
-        with self.wake:
-            # Pictures up to then belong to the episode before.
-            self.navigator.accept_goal(_seconds(stamp) if self.lock_step else
-                                       self._now() + self.navigator.limits.settle_time)
-            self.goal, self._frame = picture, None
-            self._goals += 1
-            self.wake.notify_all()
-
-    def _on_reward(self, message: Float32) -> None:
-        if not math.isfinite(message.data):
-            self.get_logger().error(f'a reward is finite; received {message.data}')
-            return
-        with self.wake:
-            self._tally.reward += message.data
-            self._tally.judged = True
-            self.wake.notify_all()
-
-    def _on_collision(self, message: Bool) -> None:
-        with self.wake:
-            self._tally.collided |= message.data
-
-    def _on_arrived(self, message: Bool) -> None:
-        with self.wake:
-            self._tally.arrived |= message.data
-
-    def _on_episode_end(self, message: UInt8) -> None:
-        with self.wake:
-            self._tally.end = message.data
-
-    def _on_scene(self, message: String) -> None:
-        try:
-            said = json.loads(message.data)
-        except ValueError:  # another kind of scene
-            return
-        if isinstance(said, dict):
-            self.scene = said
-
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        side, focal = min(message.width, message.height), message.k[0]
-        if side > 0 and math.isfinite(focal) and focal > 0:
-            self.camera_fov = 2 * math.atan(side / 2 / focal)
+    @property
+    def scene(self) -> dict:
+        """What a simulator says of itself; empty: nobody does."""
+        return self._senses.scene
 
     def _on_stop(self, _request, response):
         with self.wake:
@@ -362,12 +173,12 @@ class RosRobot(Node):
                             f'publisher(s) on {self.output.publisher.topic_name}',
                             'end the other node, or remap one of them')
         self._until(lambda: not self._missing(), lambda: f'waits for {", ".join(self._missing())}')
-        if self.camera_fov is not None:
-            crop_fraction(self.camera_fov, self.robot.camera_fov)
+        if self._senses.camera_fov is not None:
+            crop_fraction(self._senses.camera_fov, self.robot.camera_fov)
         self._threads = WorkThreads({'output': self.output.run}, self._on_failed_thread).start()
 
     def _missing(self) -> list[str]:
-        found = (('image_raw', self._frame is not None),
+        found = (('image_raw', self._senses.frame is not None),
                  ('odom', self.output.odometry is not None),
                  ('goal_image', self.goal is not None),
                  (f'somebody {self._listener_words()}', self._listeners()),
@@ -377,23 +188,23 @@ class RosRobot(Node):
     def begin(self) -> Seen:
         """Begin an episode: what the robot sees, once there is a goal and it may move."""
         def ready() -> bool:
-            if self._awaits_goal and self._goals == self._episode_goal:
+            if self._awaits_goal and self._senses.goals == self._episode_goal:
                 return False
-            return self._sees()
+            return self._senses.sees()
         self._until(ready, lambda: 'waits for the next picture on goal_image'
-                    if self._awaits_goal and self._goals == self._episode_goal else '')
+                    if self._awaits_goal and self._senses.goals == self._episode_goal else '')
         with self.wake:
-            self._tally = Tally()
-            self._episode_goal, self._awaits_goal, self._decisions = self._goals, False, 0
-            self._shown = self._look()
+            self._senses.tally = Tally()
+            self._episode_goal, self._awaits_goal, self._decisions = self._senses.goals, False, 0
+            self._shown = self._senses.look()
         return self._shown
 
     def drive(self, action: int) -> None:
         """Begin an action as soon as the robot may move."""
         def taken() -> bool:
             now = time.monotonic()
-            if self._frame is None or (
-                    ticket := self.navigator.request(self._frame[0], now)) is None:
+            if self._senses.frame is None or (
+                    ticket := self.navigator.request(self._senses.frame[0], now)) is None:
                 return False
             self.navigator.decided(ticket, action, now)
             self._cut_before = self.navigator.cut_off
@@ -402,7 +213,7 @@ class RosRobot(Node):
         with self.wake:
             self.wake.notify_all()
         self._decisions += 1
-        self._say(self._action, 'action', Int8(data=action))
+        self._topics.say(self._action, 'action', Int8(data=action))
 
     def finish(self) -> Outcome:
         """Wait until the motion is over and seen: what came of it."""
@@ -410,19 +221,19 @@ class RosRobot(Node):
 
         def over() -> bool:
             nonlocal at_rest
-            if not self._sees():
+            if not self._senses.sees():
                 return False
             at_rest = at_rest or time.monotonic()
             # In lock-step a judge speaks before the picture; one that lost its word is not
             # waited for.
-            return (not self.lock_step or self._tally.judged
+            return (not self.lock_step or self._senses.tally.judged
                     or time.monotonic() - at_rest > VERDICT)
         self._until(over)
         with self.wake:
-            said, self._tally = self._tally, Tally()
-            elsewhere = self._goals != self._episode_goal
+            said, self._senses.tally = self._senses.tally, Tally()
+            elsewhere = self._senses.goals != self._episode_goal
             cut = self.navigator.cut_off != self._cut_before
-            seen = self._shown if elsewhere else self._look()
+            seen = self._shown if elsewhere else self._senses.look()
         success = said.reward > 0 or said.arrived
         terminated = success or said.end == TERMINATED
         limit = self._decisions >= self.max_decisions and not self.count_publishers('episode_end')
@@ -443,12 +254,7 @@ class RosRobot(Node):
         if running:
             self._threads.join('output')  # it waits for nothing but `wake`
             self.output.deliver_zero()  # the output thread is gone: still only one owner
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            try:
-                writer.close()
-            except RecordingStopped as error:
-                self.get_logger().error(f'recording stopped: {error}')
+        self._topics.close()
 
     def fail(self, words: str) -> None:
         """Something broke that nobody expected: zero, and no more training."""
@@ -524,31 +330,6 @@ class RosRobot(Node):
         )
         return tuple(words for broken, words in rules if broken)
 
-    def _sees(self) -> bool:
-        """Whether there is a picture to decide on, and what belongs beside it."""
-        return (self._frame is not None and self.navigator.wants(self._frame[0])
-                and all(_nearest(rows, self._frame[0]) for rows in self._beside.values()))
-
-    def _look(self) -> Seen:
-        stamp, picture = self._frame
-        beside = {}
-        for key, rows in self._beside.items():
-            decoded = BESIDE[key][1](_nearest(rows, stamp))
-            beside[key] = np.nan_to_num(preprocess_map(decoded, self.size, **self._lens()))
-        return Seen(picture, beside)
-
-    def _prepare(self, message) -> np.ndarray:
-        lens = self._lens()
-        smallest = needed_side(self.size, **lens)
-        return preprocess(images.decode_rgb(message, smallest), self.size, **lens)
-
-    def _lens(self) -> dict[str, float]:
-        return {} if self.camera_fov is None else {
-            'fov': self.camera_fov, 'target_fov': self.robot.camera_fov}
-
-    def _now(self) -> float:
-        return self.get_clock().now().nanoseconds * 1e-9
-
     def _who(self) -> str:
         namespace = self.get_namespace().strip('/')
         return f'{namespace}: ' if namespace else ''
@@ -577,13 +358,3 @@ class RosRobot(Node):
     def _on_failed_thread(self, _threads: WorkThreads, name: str, error: Exception) -> None:
         self.fail(f'the {name} thread failed: {error!r}')
         self.output.deliver_zero()
-
-
-def _seconds(stamp) -> float:
-    return stamp.sec + stamp.nanosec * 1e-9
-
-
-def _nearest(rows: collections.deque, stamp: float) -> Any:
-    """The message nearest to a stamp, within `WINDOW`; None: there is none."""
-    near = min(rows, key=lambda row: abs(row[0] - stamp), default=None)
-    return near[1] if near is not None and abs(near[0] - stamp) <= WINDOW else None

@@ -34,6 +34,7 @@ from vn_nav.policy.checkpoint_info import (
     read_config,
 )
 from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.zhu_policy import build_policy
 
 HEADER_BYTES = 1_000_000  # of a safetensors file, beside its weights
 MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
@@ -125,7 +126,7 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
         raise UserError(f'the SHA-256 of {WEIGHTS} is the one in {CONFIG}', digest,
                         f'the file is corrupt or not the one of {where}: get it again')
     tensors = _check_weights(weights, shapes, str(folder / WEIGHTS))
-    network = Policy(network_config)
+    network = build_policy(network_config)
     network.load_state_dict(tensors)
     return LoadedCheckpoint(network.eval(), network_config, {**info, 'sha256': digest})
 
@@ -158,7 +159,7 @@ def _read_network(config: dict, where: str) -> tuple[NetworkConfig, dict[str, tu
         network = NetworkConfig(actions=tuple(names), **given)
         with torch.device('meta'):
             shapes = {name: tuple(tensor.shape)
-                      for name, tensor in Policy(network).state_dict().items()}
+                      for name, tensor in build_policy(network).state_dict().items()}
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise UserError(f'the network in {CONFIG} can be built',
                         f'{where}: {" ".join(str(error).split())[:200]}',

@@ -116,11 +116,11 @@ class Pose(NamedTuple):
 
     position: Tensor  # [N,2] x forward, y left [m]
     heading: Tensor  # [N,2] cos, sin of the goal's heading less the robot's
-    overlap: Tensor  # [N] logit: does the picture show some of what the goal picture shows?
+    co_visible: Tensor  # [N] logit: does the picture show some of what the goal picture shows?
 
 
 class GoalPose(nn.Module):
-    """Relative pose of the goal, and whether the two pictures overlap, from the features.
+    """Relative pose of the goal, and whether the two pictures show the same, from the features.
 
     Not in the thesis: the comparison of picture and goal is what a policy for unseen houses
     lacks, and its labels are free in a simulator or with odometry (docs/results.md).

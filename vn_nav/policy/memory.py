@@ -137,12 +137,12 @@ class GoalTracker(nn.Module):
                              persistent=False)
 
     @torch.no_grad()
-    def forward(self, position: Tensor, heading: Tensor, overlap: Tensor, last_action: Tensor,
+    def forward(self, position: Tensor, heading: Tensor, co_visible: Tensor, last_action: Tensor,
                 starts: Tensor, estimate: Tensor) -> tuple[Tensor, Tensor]:
         """Track through T steps.
 
         Args:
-            position: [T,B,2] m; heading: [T,B,2]; overlap: [T,B] logit: see `heads.Pose`.
+            position: [T,B,2] m; heading: [T,B,2]; co_visible: [T,B] logit: see `heads.Pose`.
             last_action: [T,B], -1 where there is none; starts: [T,B] bool.
             estimate: [B,5] before the first row.
 
@@ -152,7 +152,7 @@ class GoalTracker(nn.Module):
         """
         shift, turn = self.shift[last_action], self.turn[last_action]
         # The square of the odds: a hundred doubtful looks do not make a goal.
-        weight = (2 * overlap.clamp(-4.0, 2.3)).exp().unsqueeze(2)
+        weight = (2 * co_visible.clamp(-4.0, 2.3)).exp().unsqueeze(2)
         look = torch.cat([position, heading], dim=2)
         keep = self.FADE * (~starts).unsqueeze(2)
         rows = []

@@ -33,7 +33,7 @@ from vn_nav.policy.memory import (
     stack_frames,
 )
 from vn_nav.policy.places import WIDTH, MultiViewAveraging, PlaceClassifier, Routes
-from vn_nav.policy.zhu import FROZEN, SceneLinear, Siamese
+from vn_nav.policy.zhu import FROZEN
 
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
 # Channels that each image head draws, and the width of its inner maps. The thesis says that depth
@@ -162,7 +162,10 @@ class Latents(NamedTuple):
 class Policy(nn.Module):
     """An encoder, a memory, actor and critic (thesis, figure 4.1), and heads.
 
+    One of icra2017 is a `vn_nav.policy.zhu_policy.ScenePolicy`; `build_policy` there makes either.
+
     Attributes:
+        frozen: whether pictures pass an encoder that learns nothing before anything else.
         compute_dtype: type of the convolutions and matrix products; parameters, memory and
             outputs are float32 in any case.
         heads: the auxiliary heads by name.
@@ -170,13 +173,19 @@ class Policy(nn.Module):
         cell: pixels of the picture under one cell of these maps; both 0 where there are none.
     """
 
+    frozen = False
+
     def __init__(self, config: NetworkConfig):
         super().__init__()
         self.config = config
         self.compute_dtype = torch.float32
+        self._build(config)
+
+    def _build(self, config: NetworkConfig) -> None:
+        """The parts."""
         if config.architecture == 'icra2017':
-            self._build_scenes()
-            return
+            raise UserError('a policy of icra2017 is made by zhu_policy.build_policy',
+                            config.architecture, 'call that')
         pixels = {'mean': config.pixel_mean, 'std': config.pixel_std, 'frames': config.frames}
         own = {'fused': Fused, 'matching': Matching}.get(config.architecture)
         if own is not None:
@@ -215,17 +224,6 @@ class Policy(nn.Module):
         self.heads = nn.ModuleDict({name: self._head(name, channels, side)
                                     for name in config.heads})
 
-    def _build_scenes(self) -> None:
-        """The parts of icra2017, see `vn_nav.policy.zhu`."""
-        config, width = self.config, self.config.hidden
-        self.places = self.tracker = self.around = None
-        self.encoder = Siamese(config.frozen, config.frames, width)
-        self.memory = SceneLinear(width, width, config.scenes)
-        self.actor = SceneLinear(width, len(config.actions), config.scenes)
-        self.critic = SceneLinear(width, 1, config.scenes)
-        self.heads = nn.ModuleDict()
-        self.target_side = self.cell = 0
-
     def _initialise(self, thesis: bool) -> None:
         for layer, gain in ((self.actor, 0.01), (self.critic, 1.0)):
             if thesis:
@@ -252,15 +250,17 @@ class Policy(nn.Module):
         """An empty memory."""
         config = self.config
         if config.frames > 1:
-            before = torch.zeros(batch, config.frames - 1, 3, config.size, config.size,
-                                 dtype=torch.uint8, device=self.device)
-            if self.frozen:
-                before = torch.zeros(batch, config.frames - 1, self.encoder.frozen.features,
-                                     device=self.device)
-            return RecurrentState(before, torch.zeros(batch, 0, device=self.device))
+            return RecurrentState(self._frames_before(batch),
+                                  torch.zeros(batch, 0, device=self.device))
         zeros = torch.zeros(batch, config.hidden, device=self.device)
         beside = torch.zeros(batch, sum(self._beside), device=self.device)
         return RecurrentState(torch.cat([zeros, beside], dim=1), zeros.clone())
+
+    def _frames_before(self, batch: int) -> Tensor:
+        """What stands for the frames before an episode, [batch,frames-1,...]."""
+        config = self.config
+        return torch.zeros(batch, config.frames - 1, 3, config.size, config.size,
+                           dtype=torch.uint8, device=self.device)
 
     @property
     def _beside(self) -> tuple[int, int]:
@@ -273,25 +273,12 @@ class Policy(nn.Module):
         """Where the parameters are."""
         return next(self.parameters()).device
 
-    @property
-    def frozen(self) -> bool:
-        """Whether pictures pass an encoder that learns nothing before anything else."""
-        return self.config.architecture == 'icra2017'
-
-    def look(self, pictures: Tensor) -> Tensor:
-        """Frozen features [...,F] of pictures [...,3,S,S], to pass in place of them.
-
-        Goals take them in `Observation.goals`, pictures in `Observation.extras['features']`: what
-        never changes is then computed once.
-        """
-        return self.encoder.look(pictures)
-
     def encode_goals(self, goals: Tensor) -> Tensor:
         """What the encoder keeps of goals [G,3,S,S] uint8; see `vn_nav.policy.encoders`.
 
         A policy that knows a place keeps [G,...+K+16]: where they were taken, behind the rest.
         """
-        if self.config.frames > 1 and not self.frozen:
+        if self.config.frames > 1:
             goals = goals.repeat(1, self.config.frames, 1, 1)
         maps = self.encoder.encode_goals(goals, self.compute_dtype)
         if self.places is None:
@@ -330,10 +317,13 @@ class Policy(nn.Module):
             goal_maps = self.encode_goals(obs.goals)
         goal_maps, goal_places = self.goal_parts(goal_maps)
         maps, features, state = self._look(obs, starts, state, goal_maps)
-        if self.frozen:
-            scene = self._scene(obs)
-            own = self.memory(features.view(steps, batch, -1), scene)
-            return Latents(maps, features, torch.relu(own).float(), None, scene), state
+        return self._remember(obs, starts, state, maps, features, goal_places)
+
+    def _remember(self, obs: Observation, starts: Tensor, state: RecurrentState, maps: Tensor,
+                  features: Tensor, goal_places: Tensor | None
+                  ) -> tuple[Latents, RecurrentState]:
+        """From what is seen to what the heads read, by way of the memory."""
+        steps, batch = starts.shape
         # One-hot of the last action; all zeros (not a class) for -1, an episode's start.
         actions = torch.arange(len(self.config.actions), device=features.device)
         dtype = features.dtype
@@ -393,10 +383,7 @@ class Policy(nn.Module):
 
     def _look(self, obs: Observation, starts: Tensor, state: RecurrentState,
               goal_maps: Tensor) -> tuple[Tensor, Tensor, RecurrentState]:
-        frames = obs.image
-        if self.frozen:
-            known = (obs.extras or {}).get('features')
-            frames = self.look(obs.image) if known is None else known
+        frames = self._frames(obs)
         if self.config.frames > 1:
             image, before = stack_frames(frames, starts, state.hidden)
             state = RecurrentState(before, state.cell)
@@ -405,22 +392,13 @@ class Policy(nn.Module):
         index = None if obs.goal_index is None else obs.goal_index.flatten()
         return *self.encode(image, goal_maps, index), state
 
-    def _scene(self, obs: Observation) -> Tensor:
-        """[T,B] whose layers see the observations."""
-        if self.config.scenes == 1:
-            return torch.zeros_like(obs.last_action)
-        if 'scene' not in (obs.extras or {}):
-            raise UserError('a network with layers for several scenes is told the scene',
-                            "observations without extras['scene']", 'pass it, or train and use '
-                            'a network of one scene')
-        return obs.extras['scene']
+    def _frames(self, obs: Observation) -> Tensor:
+        """What is stacked and encoded of observations, [T,B,...]."""
+        return obs.image
 
     def read(self, latents: Latents) -> PolicyOutput:
         """Actor, critic and arrival from latents."""
         hidden = latents.hidden
-        if self.frozen:
-            return PolicyOutput(self.actor(hidden, latents.scene),
-                                self.critic(hidden, latents.scene).squeeze(-1))
         arrival = self.heads['arrival'](hidden) if 'arrival' in self.heads else None
         logits = self.actor(hidden)
         if latents.advice is not None:
@@ -451,7 +429,7 @@ def _compass(pose: Pose) -> Tensor:
 
     Without gradient: the pose is learned from poses, not bent to please the actor.
     """
-    sure = torch.sigmoid(pose.overlap).unsqueeze(1)
+    sure = torch.sigmoid(pose.co_visible).unsqueeze(1)
     return torch.cat([sure * pose.position / 3.0, sure * pose.heading, sure], dim=1).detach()
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from vn_nav.co_visibility import lift, overlap, relative_pose
+from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
@@ -79,8 +79,8 @@ class PairSampler:
 
         Returns:
             image, goal: [K,3,S,S] uint8.
-            goal_pose: [K,4] float32, see `overlap.relative_pose`.
-            overlap: [K] float32, see `overlap.overlap`.
+            goal_pose: [K,4] float32, see `co_visibility.relative_pose`.
+            overlap: [K] float32, see `co_visibility.co_visible`.
             arrived: [K] bool, by the image task's rule.
             depth: [K,S,S] float32 m; segmentation, goal_segmentation: [K,S,S] uint8.
             house: [K] int64, index; pose, goal_place: [K,4] float64 in the map frame.
@@ -96,7 +96,7 @@ class PairSampler:
         return {
             'image': image.rgb, 'goal': goal.rgb,
             'goal_pose': relative_pose(poses, goal_poses),
-            'overlap': overlap(points, image.depth, *camera),
+            'overlap': co_visible(points, image.depth, *camera),
             'arrived': self.arrived(house, poses, goal_poses),
             'depth': image.depth, 'segmentation': image.labels, 'goal_segmentation': goal.labels,
             'house': house, 'pose': poses, 'goal_place': goal_poses,
@@ -139,7 +139,7 @@ class PairSampler:
             'image': frames.rgb, 'depth': frames.depth, 'segmentation': frames.labels,
             'first': first, 'second': second,
             'goal_pose': relative_pose(poses[first], poses[second]),
-            'overlap': overlap(points[second], frames.depth[first], cameras[first], fov[first]),
+            'overlap': co_visible(points[second], frames.depth[first], cameras[first], fov[first]),
         }
 
     def poses(self, numbers: np.ndarray, robots: int = 1

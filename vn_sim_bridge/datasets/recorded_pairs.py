@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from vn_nav.co_visibility import lift, overlap, relative_pose
+from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, uniform
@@ -85,7 +85,7 @@ class GraphPairs:
         depth = graph.depth[nodes].astype(np.float32)
         cameras, fov = cameras_at(graph.poses[nodes], self._robot)
         points = lift(depth, cameras, fov)
-        return overlap(points[second], depth[first], cameras[first], fov[first])
+        return co_visible(points[second], depth[first], cameras[first], fov[first])
 
 
 @numba.njit(cache=True)

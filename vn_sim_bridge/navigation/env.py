@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from vn_nav.co_visibility import GRID, lift, overlap, relative_pose
+from vn_nav.co_visibility import GRID, co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.reset_arguments import are_several, read_options, read_seed, read_seeds
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -116,10 +116,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     `config.privileged` adds to `info`, beside pictures and the shortest path's action:
     `goal_pose` [N,4] float32, the true goal's camera as the robot sees it (see
-    `overlap.relative_pose`), and `overlap` [N] float32, the share of what the true goal's picture
-    shows that the robot's picture shows too (see `overlap.overlap`; 0 for a blank goal). Without a
-    view to go to both are zeros. `explorer_action` [N] int64 is what a robot would do that knows
-    only what it has seen (see `explorer`).
+    `co_visibility.relative_pose`), and `overlap` [N] float32, the share of what the true goal's
+    picture shows that the robot's picture shows too (see `co_visibility.co_visible`; 0 for a blank
+    goal). Without a view to go to both are zeros. `explorer_action` [N] int64 is what a robot
+    would do that knows only what it has seen (see `explorer`).
 
     Args:
         config: what to simulate.
@@ -595,7 +595,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             return np.where(self._shown_goal == self.blank_goal, np.float32(0), shown)
         # The grey picture has no points.
         picture = np.where(self._shown_goal == self.blank_goal, self.blank_goal, self._picture)
-        return overlap(self._goal_points[picture], depth, *self.backend.cameras())
+        return co_visible(self._goal_points[picture], depth, *self.backend.cameras())
 
     def oracle_actions(self) -> np.ndarray:
         """The next action [N] on a shortest path to the goal, from the simulator's geometry.

@@ -2,8 +2,9 @@
 
 The shortest path to a goal that was never seen is nothing that a policy could learn from
 pictures. This teacher drives to the nearest part of the house that the robot has not looked at
-yet, and to the goal once the camera has shown what the goal picture shows (`overlap.overlap`):
-what it does can be inferred from what the robot has seen (frontier exploration: Yamauchi 1997).
+yet, and to the goal once the camera has shown what the goal picture shows
+(`co_visibility.co_visible`): what it does can be inferred from what the robot has seen (frontier
+exploration: Yamauchi 1997).
 Targets of a loss only; no network is shown its state.
 """
 

@@ -101,7 +101,7 @@ class Robots:
     start_distance: wp.array(dtype=wp.float64)
     heading_error: wp.array(dtype=wp.float64)
     arrived: wp.array(dtype=wp.bool)
-    goal_pose: wp.array2d(dtype=wp.float32)  # as `overlap.relative_pose`
+    goal_pose: wp.array2d(dtype=wp.float32)  # as `co_visibility.relative_pose`
     path_length: wp.array(dtype=wp.float64)
     last_action: wp.array(dtype=wp.int64)
     last_reward: wp.array(dtype=wp.float32)
@@ -367,7 +367,7 @@ def begin(houses: Houses, robots: Robots, rules: Rules, n: int):
 
 @wp.func
 def compare(houses: Houses, robots: Robots, n: int):
-    """Where the goal is from here: `tasks.arrived` and `overlap.relative_pose`."""
+    """Where the goal is from here: `tasks.arrived` and `co_visibility.relative_pose`."""
     goal = wp.int32(robots.goal[n])
     yaw = robots.pose[n, 2]
     turn = houses.goal_pose[goal, 2] - yaw
@@ -487,7 +487,7 @@ def decide(houses: Houses, robots: Robots, rules: Rules, deltas: wp.array2d(dtyp
 def share_in_view(points: wp.array3d(dtype=wp.float32), picture: wp.array(dtype=wp.int64),
                   depth: wp.array3d(dtype=wp.float32), camera: wp.array2d(dtype=wp.float64),
                   focal: wp.array(dtype=wp.float64), share: wp.array(dtype=wp.float32)):
-    """As `overlap.overlap`, of the points of each robot's goal picture."""
+    """As `co_visibility.co_visible`, of the points of each robot's goal picture."""
     n = wp.tid()
     goal, size = wp.int32(picture[n]), depth.shape[1]
     frame = camera_frame(camera, n)

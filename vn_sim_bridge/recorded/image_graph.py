@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
-from vn_nav.co_visibility import overlap_by_poses, relative_pose
+from vn_nav.co_visibility import co_visible_by_poses, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess
 from vn_nav.robot import RobotSpec
@@ -76,13 +76,13 @@ class ImageGraph:
                          *self.floor.origin)
 
     def overlap(self, poses: np.ndarray, goal_poses: np.ndarray, fov: float) -> np.ndarray:
-        """What poses [N,>=3] alone say of the overlap of pictures; see `overlap_by_poses`.
+        """What poses [N,>=3] alone say of the overlap of pictures; see `co_visible_by_poses`.
 
         A straight way over the floor stands for having driven it: nothing is in between.
         """
         gap = np.hypot(*(goal_poses[:, :2] - poses[:, :2]).T)
         driven = np.where(self.in_sight(poses, goal_poses), gap, np.inf)
-        return overlap_by_poses(relative_pose(poses, goal_poses), driven, fov)
+        return co_visible_by_poses(relative_pose(poses, goal_poses), driven, fov)
 
     def floor_plan(self) -> dict:
         """See `House.floor_plan`; what is no floor counts as outside."""

@@ -167,7 +167,7 @@ class ImageGraphBackend:
 
 
 def cameras_at(poses: np.ndarray, robot: RobotSpec) -> tuple[np.ndarray, np.ndarray]:
-    """The cameras [K,5] and fov [K] of robots at poses [K,>=3], see `overlap.lift`."""
+    """The cameras [K,5] and fov [K] of robots at poses [K,>=3], see `co_visibility.lift`."""
     count = len(poses)
     return (np.column_stack([poses[:, :2], np.full(count, robot.camera_height), poses[:, 2],
                              np.full(count, robot.camera_pitch)]),

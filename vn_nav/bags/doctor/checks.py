@@ -14,7 +14,7 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
-from vn_nav.bags.doctor.checks.figures import (
+from vn_nav.bags.doctor.figures import (
     BACK,
     ERROR,
     WARNING,

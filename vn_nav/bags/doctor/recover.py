@@ -28,12 +28,13 @@ class Recovered:
     span: tuple[int, int]  # ns, of the first and the last message
     losses: list[Loss]
     missing: int | None  # messages that the files counted and that are not there; None: unknown
+    surplus: int  # messages that are there and that the files do not count
     notes: list[str]  # what is no damage
 
     @property
     def lost(self) -> bool:
-        """Whether something was lost that was in the files."""
-        return bool(self.missing) or any(not loss.harmless for loss in self.losses)
+        """Whether something was lost that was in the files, or was changed."""
+        return bool(self.missing or self.surplus) or any(not loss.harmless for loss in self.losses)
 
     def lines(self) -> list[str]:
         """The account in words, a line each."""
@@ -60,7 +61,9 @@ class Recovered:
             return 'lost: nothing that was in the file' + 's' * (len(self.losses) > 1)
         if self.missing is None:
             return 'lost messages: unknown, as a file without its end does not count them'
-        return f'lost messages: {self.missing}'
+        more = (f'; {self.surplus} more than the file counts: so many were changed, or never '
+                'were, and which cannot be known') * bool(self.surplus)
+        return f'lost messages: {self.missing}{more}'
 
 
 def recover(source: str | Path, target: str | Path) -> Recovered:
@@ -104,7 +107,8 @@ def recover(source: str | Path, target: str | Path) -> Recovered:
     by_topic: collections.Counter[str] = collections.Counter()
     for connection, count in counts.items():
         by_topic[connection.topic] += count
-    return Recovered(target, dict(by_topic), span, bag.losses, bag.missing, bag.notes)
+    return Recovered(target, dict(by_topic), span, bag.losses, bag.missing,
+                     bag.surplus, bag.notes)
 
 
 def _copy(bag: Bag, file: Path) -> tuple[dict[Connection, int], tuple[int, int]]:

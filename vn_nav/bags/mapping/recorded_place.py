@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
 from vn_nav.bags.drive import RECORDED
 from vn_nav.bags.mapping.loop_closure import ROUNDS, straighten
 from vn_nav.bags.mapping.one_place import Part, check_frame, check_place, choose, parse_pictures
-from vn_nav.bags.roles import Topics, load_topics
+from vn_nav.bags.roles import Topics
 from vn_nav.bags.storage.stream import messages
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
@@ -24,45 +24,38 @@ GOALS, LEAST_GOALS = 1000, 4
 LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by
 
 
-def add_place_options(parser: argparse.ArgumentParser) -> None:
-    """How pictures become a place."""
-    parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
-    parser.add_argument('--margin', type=float, metavar='M',
-                        help='beside the driven path that counts as free [m]; default 0.3')
-    parser.add_argument('--straighten', action=argparse.BooleanOptionalAction, default=True,
-                        help='correct odometry by the places that the drive shows twice '
-                        '(docs/bags.md)')
-    parser.add_argument('--pictures', metavar='A-B[,C-D]', help='numbers of those to learn from; '
-                        'several ranges: you vouch for their odometry being in one frame')
-    parser.add_argument('--goals', type=int, default=GOALS, help='pictures to drive to, at most')
-    parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags; '
-                        'default: `decoded` in the folder of a run, or none')
+@dataclasses.dataclass(frozen=True)
+class PlaceOptions:
+    """How the pictures of a drive become a place.
+
+    Raises:
+        UserError: values that no drive is a place with.
+    """
+
+    topics: Topics = Topics()  # names in the bag
+    margin: float | None = None  # m beside the driven path that counts as free; None: 0.3
+    straighten: bool = True  # correct odometry by the places that the drive shows twice
+    # Numbers of the pictures to learn from, 'A-B[,C-D]'; several ranges: the caller vouches for
+    # their odometry being in one frame. Empty: all that are of one place.
+    pictures: str = ''
+    goals: int = GOALS  # pictures to drive to, at most
+
+    def __post_init__(self):
+        if self.goals < LEAST_GOALS:
+            raise UserError('there are at least four goals', self.goals, 'raise --goals')
+        if self.pictures:
+            parse_pictures(self.pictures)
 
 
-def given_place_options(args: argparse.Namespace) -> list[str]:
-    """Names of those that differ from their default."""
-    given = {'--topics': args.topics, '--margin': args.margin, '--cache': args.cache,
-             '--pictures': args.pictures,
-             '--no-straighten': None if args.straighten else True,
-             '--goals': None if args.goals == GOALS else args.goals}
-    return [name for name, value in given.items() if value is not None]
-
-
-def check_place_options(args: argparse.Namespace) -> None:
-    """Refuse what no drive is a place with."""
-    if args.goals < LEAST_GOALS:
-        raise UserError('there are at least four goals', args.goals, 'raise --goals')
-    if args.pictures:
-        parse_pictures(args.pictures)
-
-
-def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec, size: int,
-               cache: Path, show: Callable[[str, float], None] = lambda stage, share: None,
+def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: RobotSpec,
+               size: int, cache: Path,
+               show: Callable[[str, float], None] = lambda stage, share: None,
                until: float = math.inf) -> Any:
     """The place out of a bag, and words about it on standard output.
 
     Args:
-        args: `bag` and the options of `add_place_options`.
+        bag: the drive.
+        options: how it becomes a place.
         build_graph: of the simulator's half, `vn_sim_bridge.recorded.image_graph.build_graph`.
         robot: that drove, with the policy's actions.
         size: side of the pictures [pixels].
@@ -74,27 +67,25 @@ def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec
         UserError: a bag without what is needed; a drive too short, of one spot, or of several
             places.
     """
-    topics = load_topics(args.topics) if args.topics else Topics()
-
     def load(side: int) -> DriveSet:
-        return load_drives(args.bag, Wanted(robot, side, topics, every=True), cache,
+        return load_drives(bag, Wanted(robot, side, options.topics, every=True), cache,
                            lambda share: show(f'pictures of {side} pixels', share))
     drives = load(size)
     facts = drives.facts
-    print(f'{args.bag}: {len(drives):,} pictures with poses in {facts["episodes"]:,} '
+    print(f'{bag}: {len(drives):,} pictures with poses in {facts["episodes"]:,} '
           f'stretch{"es" * (facts["episodes"] > 1)}; {facts["without_pose"]:,} without a pose, '
           f'{facts["jumps"]:,} jumps' + (f', {facts["set_back"]:,} times the clock of the '
                                          'pictures was set back' if facts['set_back'] else ''),
           flush=True)
     for note in facts['notes']:
-        print(f'{args.bag}: {note}', flush=True)
-    part = choose(args.bag, drives, args.pictures)
+        print(f'{bag}: {note}', flush=True)
+    part = choose(bag, drives, options.pictures)
     if len(part.rows) < len(drives):
         print(f'{len(part.rows):,} of the {len(drives):,} pictures are used'
-              + (f': {args.pictures}' if args.pictures else ''), flush=True)
-    margin = {} if args.margin is None else {'margin': args.margin}
+              + (f': {options.pictures}' if options.pictures else ''), flush=True)
+    margin = {} if options.margin is None else {'margin': options.margin}
     stretch = part.stretch
-    if args.straighten:
+    if options.straighten:
         # Larger pictures than the network's tell more exactly where they were taken.
         large = load(LOOKED_AT) if size < LOOKED_AT else drives
         found = straighten(part.of(large), robot, stretch=stretch, until=until,
@@ -108,8 +99,8 @@ def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec
     show('the place', 0.0)
     return build_graph(
         part.drives.image, poses, _episodes(part), robot, depth=part.drives.depth,
-        farthest=MAX_DEPTH, goals=args.goals, goal_pictures=drives.goals, **margin,
-        world_version=str(scene_of(args.bag).get('world_version', RECORDED)))
+        farthest=MAX_DEPTH, goals=options.goals, goal_pictures=drives.goals, **margin,
+        world_version=str(scene_of(bag).get('world_version', RECORDED)))
 
 
 def _episodes(part: Part) -> np.ndarray:

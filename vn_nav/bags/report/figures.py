@@ -10,7 +10,7 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_rgb
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.doctor.checks.figures import NOISE
+from vn_nav.bags.doctor.figures import NOISE
 from vn_nav.bags.drive import Frame
 
 BINS = 240  # stretches of time, at most

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from vn_nav import __version__
-from vn_nav.bags.doctor.checks.figures import ERROR, Finding, TopicFigures
+from vn_nav.bags.doctor.figures import ERROR, Finding, TopicFigures
 from vn_nav.bags.drive import COARSE, COMMAND_LASTS
 from vn_nav.bags.report.agreement import END, OTHER, STOP, Agreement, Disagreement, Judged
 from vn_nav.bags.report.figures import STRIP, Shot, Timeline

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
-from vn_nav.bags.doctor.checks.checks import diagnose
-from vn_nav.bags.doctor.checks.figures import Diagnosis
+from vn_nav.bags.doctor.checks import diagnose
+from vn_nav.bags.doctor.figures import Diagnosis
 from vn_nav.bags.drive import (
     Cutter,
     Frame,

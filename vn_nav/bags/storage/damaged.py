@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame
-import zstandard
-
+from vn_nav.bags.storage.chunk import ChunkHead, chunk_head, mended_head, right_size, unpack
+from vn_nav.bags.storage.damage import Account, Loss
+from vn_nav.bags.storage.evidence import (
+    COMPRESSIONS,
+    DECLARATION_START,
+    DELIMITED,
+    IN_DATA,
+    MESSAGE_START,
+    Evidence,
+)
+from vn_nav.bags.storage.index import Index, index_of
 from vn_nav.bags.storage.records import (
     ATTACHMENT,
     CHANNEL,
@@ -28,48 +35,17 @@ from vn_nav.bags.storage.records import (
     METADATA,
     SCHEMA,
     UNKNOWN,
-    ChunkHead,
     Damage,
     Declared,
-    Fields,
     Message,
-    chunk_head,
-    unpack,
 )
-from vn_nav.bags.storage.salvage import (
-    DECLARATION_START,
-    DELIMITED,
-    IN_DATA,
-    LOOK,
-    MESSAGE_START,
-    Evidence,
-    Gap,
-    declare,
-    salvaged,
-    swallowed,
-)
-from vn_nav.bags.storage.summary import MAGIC, WINDOW, Chunks, crc_of
+from vn_nav.bags.storage.salvage import Gap, declare, mistaken, salvaged, swallowed
+from vn_nav.bags.storage.summary import MAGIC, WINDOW, Summary, crc_of, peek
 
-MAX_LOSSES = 1000  # that are told one by one
 CANDIDATE = 256  # bytes of patience that a place costs which only looks like a record
 _CHUNK_START = re.compile(rb'\x06.{7}\0.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)', re.DOTALL)
-_WITHOUT_MESSAGES = (HEADER, MESSAGE_INDEX, ATTACHMENT, METADATA)
-_ENTRY = 16  # bytes that a message takes in an index: less than in a chunk
-
-
-@dataclasses.dataclass
-class Loss:
-    """A stretch of a file that could not be used, or another fault of it (0 bytes)."""
-
-    path: Path
-    offset: int
-    size: int  # bytes
-    reason: str
-    chunks: int = 0  # that are known to have been there
-    messages: int | None = None  # that are known to have been there
-    harmless: bool = False  # no message can have been in it
-    before: int | None = None  # ns, time of the last message before
-    after: int | None = None  # ns, time of the first message after
+_WITHOUT_MESSAGES = (HEADER, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
+_MARK = 4  # bytes of the body of the record that ends the data
 
 
 class DamagedFile:
@@ -79,27 +55,27 @@ class DamagedFile:
         path: of the file.
         file: the same, open.
         limit: where the data end, or the file.
-        ended: `limit` is where the data end.
-        crc: have the checksum of all records in `crc`.
-        chunks: where chunks begin, as far as the summary says.
+        summary: what the file says of itself.
         declared: the channels that the summary declares.
+        losses: those so far; more are appended.
+        crc: have the checksum of all records in `crc`.
     """
 
-    def __init__(self, path: Path, file: BinaryIO, limit: int, chunks: Chunks,
-                 declared: Declared, *, ended: bool, crc: bool = False):
-        self._path, self._file, self._limit, self._ended = path, file, limit, ended
-        self._chunks, self._declared = chunks, declared
-        self.losses: list[Loss] = []
-        self.count = 0  # messages
+    def __init__(self, path: Path, file: BinaryIO, limit: int, summary: Summary,
+                 declared: Declared, losses: list[Loss], *, crc: bool = False):
+        self._file, self._limit, self._ended = file, limit, summary.data_end is not None
+        self._chunks, self._declared = summary.chunks, declared
+        self._account = Account(path, losses)
         self.unchecked = 0  # messages that no checksum of a chunk covers
         self.passed: collections.Counter[int] = collections.Counter()  # bytes by unknown kind
         self.ahead: int | None = None
         # Of all records; None: some were left out.
         self.crc: int | None = zlib.crc32(MAGIC) if crc else None
-        self._seen: int | None = None  # ns
-        self._chunked = bool(chunks)
+        self._chunked = bool(self._chunks)
+        self._looked: tuple[int, bool] = -1, False  # whether a chunk is where the index has one
         self._patience = 4 * limit + (64 << 20)  # bytes that may be read in vain
-        self._evidence = Evidence(self._peek, limit, declared, IN_DATA, cut=not ended)
+        self._evidence = Evidence(self._peek, limit, declared, IN_DATA, cut=not self._ended,
+                                  span=summary.span, first=len(MAGIC))
 
     def messages(self) -> Iterator[Message]:
         """The messages that are asked for; ends, and never raises `Damage`."""
@@ -107,12 +83,9 @@ class DamagedFile:
         while at < self._limit:
             opcode = 0
             try:
-                opcode, length = self._head(at)
-                if opcode != CHUNK and at in self._chunks:
-                    self._mended(at, f'a chunk, by the index, has the kind {opcode}')
-                    opcode = CHUNK
-                if opcode in (DATA_END, FOOTER) and length == (4 if opcode == DATA_END else 20):
-                    if self._ended:
+                opcode, length = self._kind(at, trusted)
+                if opcode == DATA_END and length == _MARK or opcode == FOOTER and length == 20:
+                    if self._ended and at + HEAD.size + length < self._limit:
                         raise Damage('the data end before their end')
                     break
                 end = yield from self._record(at, opcode, length, trusted)
@@ -127,20 +100,31 @@ class DamagedFile:
                 harmless = trusted and opcode in _WITHOUT_MESSAGES
                 if end is None:
                     end = self._search(at + 1)
-                    trusted = end in self._chunks
-                self._lose(at, end, damage.fault, opcode, harmless)
+                    trusted = self._indexed(end)
+                chunks = max(int(opcode == CHUNK), self._chunks.between(at, end))
+                self._account.lose(at, end, damage.fault, chunks, harmless=harmless)
                 at = end
+
+    def _kind(self, at: int, trusted: bool) -> tuple[int, int]:
+        """What the record at a place is, and the length that it declares."""
+        stated, length = self._head(at)
+        opcode = self._evidence.kind(at, stated, length) if trusted else stated
+        if opcode != CHUNK and self._indexed(at):
+            opcode = CHUNK
+        if opcode != stated:
+            self._mended(at, mistaken(stated, opcode))
+        return opcode, length
 
     def _record(self, at: int, opcode: int, length: int, trusted: bool
                 ) -> Iterator[Message]:
         """The messages of a record; returns where it ends."""
         if opcode == CHUNK:
-            self._chunked = True
+            self._chunked |= self._is_chunk(at)
             if self._chunks.skips(at):
                 self.crc = None
                 return self._evidence.delimited_end(at, opcode, length)
             return (yield from self._chunk(at, length, trusted))
-        following = self._chunks.next(at + 1)
+        following = self._next_chunk(at + 1)
         if opcode == MESSAGE:
             end = self._evidence.message_end(at)
             if end - at > MAX_RECORD or following is not None and end > following:
@@ -151,14 +135,18 @@ class DamagedFile:
             yield from self._messages(record, at, end)
             return end
         if opcode == HEADER and at == len(MAGIC) or opcode in DELIMITED and opcode != HEADER:
-            end = self._evidence.delimited_end(at, opcode, length)
+            declares = opcode in (SCHEMA, CHANNEL)
+            end = (self._evidence.declaration_end if declares else self._evidence.delimited_end)(
+                at, opcode, length)
             if end != at + HEAD.size + length:
                 self._mended(at, f'a record of kind {opcode} declares a wrong length')
-            if opcode in (SCHEMA, CHANNEL):
+            if declares:
                 if end - at > MAX_RECORD:
                     raise Damage(f'a record has more than {MAX_RECORD} bytes')
-                declare(self._declared, opcode, self._peek(at + HEAD.size, end - at - HEAD.size),
-                        end)
+                body = self._peek(at + HEAD.size, end - at - HEAD.size)
+                if words := declare(self._declared, opcode, body, end):
+                    self._mended(at, words)
+                self._tell_disputes(at)
         else:
             end = at + HEAD.size + length
             if end > self._limit or not self._evidence.begins(end):
@@ -175,10 +163,13 @@ class DamagedFile:
         _, _, channel, sequence, log_time, publish_time = MESSAGE_FIELDS.unpack_from(record)
         if channel not in self._declared.chosen:
             raise Damage(self._declared.unknown(channel), end=end)
-        self._go_on((log_time, log_time))
+        if self._chunked and not self._evidence.in_span(log_time):
+            raise Damage('a message outside the chunks is of a time that the file does not state',
+                         end=end)
+        self._account.go_on((log_time, log_time))
         connection = self._declared.chosen[channel]
         if connection is not None:
-            self.count += 1
+            self._declared.read[channel] += 1
             self.unchecked += 1
             yield Message(connection, sequence, log_time, publish_time,
                           record[MESSAGE_FIELDS.size:])
@@ -187,30 +178,37 @@ class DamagedFile:
         """The messages of a chunk; returns where it ends."""
         data, head, end = self._unpacked(at, length)
         sure = bool(head.crc)
-        index = {} if sure else self._index(end, len(data))
+        index = Index({}, []) if sure else index_of(
+            self._peek, self._evidence, end, data, self._declared, self._chunks.held(at),
+            head.span)
+        span = None if head.span == (0, 0) else head.span
         if not (trusted or sure) and any(isinstance(part, Gap) for part in salvaged(
-                data, self._declared, index)):  # it may only look like a chunk
+                data, self._declared.again(lambda _: True, forgiving=True), index.messages,
+                span=span)):  # it may only look like a chunk
             raise Damage('a chunk is not whole')
-        self._go_on(head.span)
+        self._account.go_on(head.span)
         self.ahead = self._chunks.ahead(at) if at in self._chunks else self.ahead
-        for part in salvaged(data, self._declared, index, sure=sure):
+        for fault in index.faults:
+            self._mended(end, fault)
+        for part in salvaged(data, self._declared, index.messages, sure=sure, span=span):
             if isinstance(part, Gap) and part.start == part.end:
                 self._mended(at, part.fault)
             elif isinstance(part, Gap):
                 self.crc = None
-                self._lose_within(at, head, part)
+                begin = None if head.compression else at + HEAD.size + head.at
+                self._account.lose_within(begin, at, part, head.span)
             else:
-                self.count += 1
                 self.unchecked += not sure
                 yield part
+        self._tell_disputes(at)
         return end
 
     def _unpacked(self, at: int, length: int) -> tuple[bytes, ChunkHead, int]:
         """The records of a chunk, its fields, where it ends: what two of three lengths say."""
-        head, mended = _head_of(self._peek(at + HEAD.size, 64), length)
+        head, mended = mended_head(self._peek(at + HEAD.size, 64), length)
         begin = at + HEAD.size + head.at
         rest = length - head.at
-        following = self._chunks.next(at + 1)
+        following = self._next_chunk(at + 1)
         top = self._limit if following is None else min(following, self._limit)
         sizes = [head.stored, rest] + [head.size] * (head.compression == '')
         believed = [size for size in dict.fromkeys(sizes) if 0 <= size <= top - begin and (
@@ -229,39 +227,13 @@ class DamagedFile:
             if size > MAX_RECORD:
                 raise Damage(f'a chunk has {size} bytes, more than {MAX_RECORD}')
             stored = self._peek(begin, size)
-            right = _right_size(head, stored)
+            right = right_size(head, stored)
             data = unpack(memoryview(stored), right)
         except Damage as damage:
             raise Damage(damage.fault, end=end, cost=damage.cost) from damage
         if mended or right != head or end != at + HEAD.size + length:
-            self._mended(at, 'a chunk declares a wrong length')
-        return data, head, end
-
-    def _index(self, at: int, size: int) -> dict[int, tuple[int, int]]:
-        """Channel and time [ns] of the messages of a chunk that ends here, by their place."""
-        found: dict[int, tuple[int, int]] = {}
-        left = size // _ENTRY + 64 * HEAD.size
-        while left > 0:
-            head = self._peek(at, HEAD.size)
-            if len(head) < HEAD.size or head[0] != MESSAGE_INDEX:
-                break
-            try:
-                end = self._evidence.delimited_end(at, *HEAD.unpack(head))
-                if end - at > size + LOOK:
-                    break
-                fields = Fields(self._peek(at + HEAD.size, end - at - HEAD.size))
-                channel, = fields.numbers('<H')
-                entries = Fields(fields.data())
-                while entries.left:
-                    time, place = entries.numbers('<QQ')
-                    found[place] = channel, time
-                    left -= 1
-            except Damage as damage:
-                if damage.end is None:
-                    break
-                end = damage.end
-            at, left = end, left - 1
-        return found
+            self._mended(at, 'a chunk declares a wrong length or checksum')
+        return data, right, end
 
     def _head(self, at: int) -> tuple[int, int]:
         """Opcode and length of the record at a place."""
@@ -271,15 +243,14 @@ class DamagedFile:
         return HEAD.unpack(head)
 
     def _peek(self, at: int, size: int) -> bytes:
-        self._file.seek(at)
-        return self._file.read(max(min(size, self._limit - at), 0))
+        return peek(self._file, at, min(size, self._limit - at))
 
     def _search(self, at: int) -> int:
         """Where the next chunk begins, by the index or by its looks; `limit`: nowhere.
 
         A file without chunks has its messages and declarations searched as well.
         """
-        known = self._chunks.next(at)
+        known = self._next_chunk(at)
         if self._patience <= 0 or known is not None and known < self._limit:
             return self._limit if self._patience <= 0 else known
         patterns = (_CHUNK_START, MESSAGE_START, DECLARATION_START)[:1 if self._chunked else 3]
@@ -314,73 +285,39 @@ class DamagedFile:
                 return (head.stored == length - head.at and length <= self._limit - at - HEAD.size
                         and max(head.size, length) <= MAX_RECORD)
             self._evidence.message_end(at)
-            return self._evidence.begins(at, self._seen, 0)
+            return self._evidence.begins(at, self._account.seen, 0)
         except Damage:
             return False
 
-    def _go_on(self, span: tuple[int, int]) -> None:
-        """Note that the messages of a time [ns] follow."""
-        start, end = span
-        if start > end or (start, end) == (0, 0):  # a chunk without messages
-            return
-        if self.losses and self.losses[-1].after is None and self.losses[-1].size:
-            self.losses[-1].after = start
-        self._seen = end if self._seen is None else max(self._seen, end)
+    def _next_chunk(self, at: int) -> int | None:
+        """The first place at or behind this one where the index has a chunk, and one is."""
+        while (place := self._chunks.next(at)) is not None and not self._is_chunk(place):
+            at = place + 1
+        return place
+
+    def _indexed(self, at: int) -> bool:
+        return at in self._chunks and self._is_chunk(at)
+
+    def _is_chunk(self, at: int) -> bool:
+        """Whether a chunk begins at a place, by its opcode and fields or by the latter alone."""
+        if self._looked[0] != at:
+            head = self._peek(at, 64)
+            found = False
+            if len(head) >= HEAD.size:
+                opcode, length = HEAD.unpack_from(head)
+                found = (opcode == CHUNK and (length <= self._limit - at - HEAD.size
+                                              or head[HEAD.size + 28:].startswith(COMPRESSIONS))
+                         or self._evidence.kind(at, opcode, length) == CHUNK)
+            self._looked = at, found
+        return self._looked[1]
+
+    def _tell_disputes(self, at: int) -> None:
+        for fault, sure in self._declared.disputes:
+            self._account.fault(at, fault, harmless=sure)
+            self.crc = None
+        self._declared.disputes.clear()
 
     def _mended(self, at: int, words: str) -> None:
         """Note a fault that cost nothing."""
         self.crc = None
-        if len(self.losses) < MAX_LOSSES:
-            self.losses.append(Loss(self._path, at, 0, words, harmless=True))
-
-    def _lose(self, start: int, end: int, fault: str, opcode: int, harmless: bool) -> None:
-        chunks = max(int(opcode == CHUNK), self._chunks.between(start, end))
-        last = self.losses[-1] if self.losses else None
-        if last is not None and (len(self.losses) >= MAX_LOSSES or (
-                last.size and last.offset + last.size == start)):
-            last.size += end - start
-            last.chunks += chunks
-            last.after = last.messages = None
-            last.harmless &= harmless
-        else:
-            self.losses.append(Loss(self._path, start, end - start, fault, chunks,
-                                    harmless=harmless, before=self._seen))
-
-    def _lose_within(self, at: int, head: ChunkHead, gap: Gap) -> None:
-        """Note bytes of a chunk's records; the place is exact where they are not compressed."""
-        place = f'byte {gap.start} of the records of a chunk: {gap.fault}'
-        if not head.compression:
-            at, place = at + HEAD.size + head.at + gap.start, f'in a chunk: {gap.fault}'
-        if len(self.losses) >= MAX_LOSSES:
-            self.losses[-1].size += gap.end - gap.start
-            self.losses[-1].messages, self.losses[-1].harmless = None, False
-        else:
-            self.losses.append(Loss(self._path, at, gap.end - gap.start, place,
-                                    messages=gap.messages, before=head.span[0],
-                                    after=head.span[1]))
-
-
-def _head_of(body: bytes, length: int) -> tuple[ChunkHead, bool]:
-    """The fields of a chunk, and whether the name of its compression had to be mended.
-
-    It is the one that lets the lengths agree.
-    """
-    for name in (b'', b'lz4', b'zstd'):
-        begin = 28 + 4 + len(name)
-        if int.from_bytes(body[begin:begin + 8], 'little') == length - begin - 8:
-            right = body[:28] + len(name).to_bytes(4, 'little') + name + body[begin:]
-            return chunk_head(right), right != body
-    return chunk_head(body), False
-
-
-def _right_size(head: ChunkHead, stored: bytes) -> ChunkHead:
-    """The fields with the size of the records mended, where one bit of it is wrong."""
-    size = len(stored)
-    try:
-        if head.compression == 'zstd':
-            size = zstandard.frame_content_size(stored)
-        elif head.compression == 'lz4':
-            size = lz4.frame.get_frame_info(stored)['content_size']
-    except (zstandard.ZstdError, RuntimeError, ValueError):
-        return head
-    return head._replace(size=size) if size > 0 and (size ^ head.size).bit_count() == 1 else head
+        self._account.fault(at, words)

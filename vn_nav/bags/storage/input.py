@@ -8,7 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from vn_nav.bags.storage.damaged import DamagedFile, Loss
+from vn_nav.bags.storage.chunk import unpacked
+from vn_nav.bags.storage.count import Count, compared
+from vn_nav.bags.storage.damage import Loss
+from vn_nav.bags.storage.damaged import DamagedFile
+from vn_nav.bags.storage.evidence import IN_CHUNKS, IN_DATA, Evidence
 from vn_nav.bags.storage.records import (
     A_BAG,
     CHANNEL,
@@ -25,10 +29,10 @@ from vn_nav.bags.storage.records import (
     Declared,
     Message,
     records,
-    unpacked,
     words,
 )
-from vn_nav.bags.storage.summary import MAGIC, Summary, crc_of
+from vn_nav.bags.storage.salvage import mistaken
+from vn_nav.bags.storage.summary import MAGIC, Summary, crc_of, peek
 
 __all__ = ['Loss', 'McapFile']
 
@@ -49,6 +53,7 @@ class McapFile:
         self.path, self.strict = Path(path), strict
         self.losses: list[Loss] = []
         self.missing: int | None = None  # messages that the file counts and that were not read
+        self.surplus = 0  # messages that were read and that the file does not count
         self.unchecked = 0  # messages that no checksum covers, of those that were read; not strict
         self.passed: dict[int, int] = {}  # bytes of records of unknown kinds; not strict
         self._ahead_of: DamagedFile | None = None
@@ -97,7 +102,8 @@ class McapFile:
         """
         self.losses, self._ahead, self._ahead_of = list(self._opening), None, None
         declared = self._summary.declared.again(
-            lambda name: topics is None or name.lstrip('/') in topics)
+            lambda name: topics is None or name.lstrip('/') in topics,
+            forgiving=not self.strict)
         # A chunk that is passed over may declare a schema that the summary lacks.
         unwanted = [number for number, chosen in declared.chosen.items() if chosen is None]
         skipped = self._summary.chunks.skip(unwanted if declared.whole else ())
@@ -131,8 +137,12 @@ class McapFile:
         return next(end for end in ends if end is not None)
 
     def _strictly(self, file: BinaryIO, declared: Declared, crcs: bool) -> Iterator[Message]:
-        chunks, limit, at, count = self._summary.chunks, self._limit, len(MAGIC), 0
+        chunks, limit, at = self._summary.chunks, self._limit, len(MAGIC)
         crc = zlib.crc32(MAGIC) if crcs else None
+        # A checksum or a count finds out whether a record is taken for one of another kind.
+        evidence = None if crcs or self._summary.total is not None else Evidence(
+            lambda place, size: peek(file, place, min(size, limit - place)), limit, declared,
+            IN_DATA, first=len(MAGIC))
         following = chunks.next(at)
         try:
             while at < limit:
@@ -145,22 +155,23 @@ class McapFile:
                 if following is not None and end > following:
                     raise Damage(f'a record declares {length} bytes, over the chunk that the '
                                  f'index has at byte {following}')
+                if evidence is not None:
+                    _check_kind(evidence, at, opcode, length)
+                    file.seek(at + HEAD.size)
                 if opcode == CHUNK and not chunks.skips(at):
                     body = _read(file, length)
                     crc = None if crc is None else zlib.crc32(body, zlib.crc32(head, crc))
-                    data, _ = unpacked(body)
+                    data, chunk = unpacked(body)
                     del body
                     if (ahead := chunks.ahead(at)) is not None:
                         self._ahead = ahead
-                    for message in records(data, declared):
-                        count += 1
-                        yield message
+                    yield from records(data, declared)
+                    if evidence is not None and not chunk.crc:
+                        _check_kinds(data, declared, chunk.span)
                 elif opcode in (SCHEMA, CHANNEL, MESSAGE):
                     record = head + _read(file, length)
                     crc = None if crc is None else zlib.crc32(record, crc)
-                    for message in records(record, declared):
-                        count += 1
-                        yield message
+                    yield from records(record, declared)
                 elif opcode in (DATA_END, FOOTER):
                     raise Damage('the data end before their end')
                 elif crc is not None:
@@ -168,18 +179,20 @@ class McapFile:
                 at = end
         except Damage as damage:
             raise BagError(self.path, damage.fault, at) from damage
-        for fault in self._faults(count, crc, declared):
+        count = self._compare(declared)
+        for fault in (*count.faults, *count.doubts, *self._data_fault(crc)):
             raise BagError(self.path, fault)
 
     def _leniently(self, file: BinaryIO, declared: Declared, crcs: bool) -> Iterator[Message]:
         reading = self._ahead_of = DamagedFile(
-            self.path, file, self._limit, self._summary.chunks, declared,
-            ended=self._summary.data_end is not None, crc=crcs)
-        reading.losses = self.losses
+            self.path, file, self._limit, self._summary, declared, self.losses, crc=crcs)
         yield from reading.messages()
-        faults = self._faults(reading.count, reading.crc, declared)
-        if not any(loss.size for loss in self.losses):
-            self.losses += [Loss(self.path, 0, 0, fault) for fault in faults]
+        count = self._compare(declared)
+        self.losses += [Loss(self.path, self._size, 0, doubt, harmless=True)
+                        for doubt in count.doubts]
+        if count.surplus or not any(loss.size and not loss.harmless for loss in self.losses):
+            self.losses += [Loss(self.path, 0, 0, fault)
+                            for fault in (*count.faults, *self._data_fault(reading.crc))]
         self.passed = dict(reading.passed)
         checked = reading.crc is not None and reading.crc == self._summary.data_crc
         self.unchecked = 0 if checked else reading.unchecked
@@ -200,19 +213,15 @@ class McapFile:
             raise Damage(f'a record has {length} bytes, more than {MAX_RECORD}')
         return opcode, length, head
 
-    def _faults(self, count: int, crc: int | None, declared: Declared) -> list[str]:
-        """Compare what was read with what the file says of itself."""
-        expected = self._summary.total
-        if any(chosen is None for chosen in declared.chosen.values()):
-            expected = None if self.counts is None else sum(
-                self.counts.get(k, 0) for k, c in declared.chosen.items() if c is not None)
-        self.missing = None if expected is None else expected - count
-        faults = []
-        if self.missing:
-            faults.append(f'it counts {expected} messages, and {count} were read')
-        if crc is not None and crc != self._summary.data_crc:
-            faults.append('the checksum of its data does not match')
-        return faults
+    def _compare(self, declared: Declared) -> Count:
+        """Compare what was read with what the file counts."""
+        count = compared(self._summary.total, self.counts, declared)
+        self.missing, self.surplus = count.missing, count.surplus
+        return count
+
+    def _data_fault(self, crc: int | None) -> list[str]:
+        wrong = crc is not None and crc != self._summary.data_crc
+        return ['the checksum of its data does not match'] * wrong
 
 
 def _read(file: BinaryIO, size: int) -> bytes:
@@ -220,3 +229,19 @@ def _read(file: BinaryIO, size: int) -> bytes:
     if len(data) < size:
         raise Damage('the file became shorter while it was read')
     return data
+
+
+def _check_kind(evidence: Evidence, at: int, opcode: int, length: int) -> None:
+    if (kind := evidence.kind(at, opcode, length)) != opcode:
+        raise Damage(mistaken(opcode, kind))
+
+
+def _check_kinds(data: bytes, declared: Declared, span: tuple[int, int]) -> None:
+    """The same of the records of a chunk, which are whole."""
+    evidence = Evidence(lambda at, size: data[at:at + size], len(data), declared, IN_CHUNKS,
+                        span=span)
+    at = 0
+    while at < len(data):
+        opcode, length = HEAD.unpack_from(data, at)
+        _check_kind(evidence, at, opcode, length)
+        at += HEAD.size + length

@@ -7,14 +7,11 @@ whatever is wrong is one error.
 
 from __future__ import annotations
 
+import collections
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
-
-import lz4.frame
-import zstandard
 
 from vn_nav.errors import UserError
 
@@ -31,9 +28,6 @@ MAX_TIME = 2**63 - 1  # ns: the year 2262, and what rosbag2's own times can hold
 
 HEAD = struct.Struct('<BQ')  # opcode, length
 MESSAGE_FIELDS = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
-_CHUNK = struct.Struct('<QQQI')  # start, end, size, CRC
-# Bytes that a byte can stand for at most: a block of 128 KiB in 4 bytes; a match of 255 bytes.
-_MOST = {'zstd': 1 << 15, 'lz4': 255}
 # Kinds that would hide messages, a message that is too short, and what is no kind at all.
 NEVER_IN_CHUNKS = (0, MESSAGE, CHUNK, DATA_END, FOOTER)
 OVERHEAD = 256  # bytes of memory that a channel takes beside its texts
@@ -139,10 +133,17 @@ class Declared:
     Args:
         path: of the file.
         wanted: whether the messages of a topic are asked for.
+        forgiving: two declarations of one number that differ are no damage but a dispute.
+
+    Attributes:
+        read: messages that were read, by channel, of those that are asked for.
+        disputes: in words, and whether it is known which declaration is right.
     """
 
-    def __init__(self, path: Path, wanted: Callable[[str], bool]):
-        self._path, self._wanted, self._size = path, wanted, 0
+    def __init__(self, path: Path, wanted: Callable[[str], bool], *, forgiving: bool = False):
+        self._path, self._wanted, self._size, self._forgiving = path, wanted, 0, forgiving
+        self.read: collections.Counter[int] = collections.Counter()
+        self.disputes: list[tuple[str, bool]] = []
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._declared: dict[int, tuple] = {}  # schema, topic, encoding, metadata of a channel
         self._waiting: dict[int, list[int]] = {}  # channels whose schema has not come, by schema
@@ -167,7 +168,7 @@ class Declared:
             for channel in self._waiting.pop(number, ()):
                 self._settle(channel)
         elif self._schemas[number] != schema:
-            raise Damage(f'schema {number} ({schema[0]}) is declared twice, and differently')
+            self._dispute(f'schema {number} ({schema[0]}) is declared twice, and differently')
 
     def channel(self, fields: Fields) -> None:
         number, schema = fields.numbers('<HH')
@@ -177,9 +178,9 @@ class Declared:
             metadata.append((pairs.text(), pairs.text()))
         channel = schema, topic, encoding, tuple(sorted(metadata))
         if self._declared.setdefault(number, channel) is not channel:
-            if self._declared[number] != channel:
-                raise Damage(f'channel {number} ({topic}) is declared twice, and differently')
-            return
+            if self._declared[number] == channel or not self._replaces(number, channel):
+                return
+            self._declared[number] = channel
         self._grow(len(topic) + sum(len(a) + len(b) for a, b in metadata) + OVERHEAD)
         if not self._wanted(topic):
             self.chosen[number] = None
@@ -188,9 +189,13 @@ class Declared:
         else:
             self._settle(number)
 
-    def again(self, wanted: Callable[[str], bool]) -> Declared:
+    def knows(self, opcode: int, number: int) -> bool:
+        """Whether a schema or channel is declared."""
+        return number in (self._schemas if opcode == SCHEMA else self._declared)
+
+    def again(self, wanted: Callable[[str], bool], *, forgiving: bool = False) -> Declared:
         """The same declarations, with other topics asked for."""
-        copy = Declared(self._path, wanted)
+        copy = Declared(self._path, wanted, forgiving=forgiving)
         copy._size, copy._schemas = self._size, dict(self._schemas)
         copy._declared, copy.channels = dict(self._declared), dict(self.channels)
         copy._waiting = {schema: list(numbers) for schema, numbers in self._waiting.items()}
@@ -207,6 +212,29 @@ class Declared:
             return f'a message is of channel {channel}, which nothing declares'
         schema, topic, *_ = self._declared[channel]
         return f'the channel of {topic} has schema {schema}, which nothing declares'
+
+    def _replaces(self, number: int, channel: tuple) -> bool:
+        """Whether another declaration of a channel is the right one; the first is forgotten.
+
+        It is where its schema is declared and that of the first one is not.
+        """
+        schema, topic, *_ = channel
+        first = self._declared[number][0]
+        right, other = schema in self._schemas, not first or first in self._schemas
+        self._dispute(f'channel {number} ({topic}) is declared twice, and differently',
+                      sure=right != other)
+        if other or not right:
+            return False
+        self._waiting[first].remove(number)
+        if not self._waiting[first]:
+            del self._waiting[first]
+        self.chosen.pop(number, None)
+        return True
+
+    def _dispute(self, words: str, *, sure: bool = False) -> None:
+        if not self._forgiving:
+            raise Damage(words)
+        self.disputes.append((words, sure))
 
     def _settle(self, number: int) -> None:
         schema, topic, encoding, metadata = self._declared[number]
@@ -234,95 +262,10 @@ def pairs(fields: Fields) -> bytes:
     return data
 
 
-class ChunkHead(NamedTuple):
-    """What a chunk says of its records."""
-
-    span: tuple[int, int]  # ns, of the first and last message; (0, 0) where it has none
-    size: int  # bytes of the records
-    crc: int  # of them; 0: unknown
-    compression: str
-    at: int  # where they begin in the chunk's body
-    stored: int  # bytes that they take there
-
-
-def chunk_head(body: bytes) -> ChunkHead:
-    """The fields of a chunk before its records; what it declares is not compared yet."""
-    fields = Fields(body)
-    start, end, size, crc = fields.numbers(_CHUNK)
-    compression = fields.text(name=True)
-    stored, = fields.numbers('<Q')
-    return ChunkHead((start, end), size, crc, compression, fields.at, stored)
-
-
-def unpacked(body: bytes) -> tuple[bytes, ChunkHead]:
-    """The records of a chunk. Fields that a later version appended are passed over."""
-    head = chunk_head(body)
-    left = len(body) - head.at - head.stored
-    if left < 0:
-        raise Damage(f'a chunk declares {head.stored} bytes and has {left + head.stored}')
-    if left >= HEAD.size and begins_record(body[-left:]):
-        raise Damage('a chunk goes on behind its records, over other records of the file')
-    return unpack(memoryview(body)[head.at:head.at + head.stored], head), head
-
-
-def begins_record(data: bytes) -> bool:
-    """Whether bytes look like a record that may follow a chunk."""
-    opcode, length = HEAD.unpack_from(data)
-    return opcode in (CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END, SCHEMA, CHANNEL,
-                      MESSAGE) and length < 1 << 40
-
-
-def unpack(stored: memoryview, head: ChunkHead) -> bytes:
-    """The records of a chunk out of the bytes that it stores them in."""
-    size, cost = head.size, len(stored) + head.size
-    if size > MAX_RECORD:
-        raise Damage(f'a chunk declares {size} bytes, more than {MAX_RECORD}')
-    try:
-        data = _inflate(stored, head.compression, size)
-    except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
-        raise Damage(f'a chunk cannot be decompressed ({head.compression}): {words(error)}',
-                     cost=cost) from error
-    if len(data) != size:
-        raise Damage(f'a chunk declares {size} bytes and holds another number', cost=cost)
-    if head.crc and zlib.crc32(data) != head.crc:
-        raise Damage('the checksum of a chunk does not match', cost=cost)
-    return data
-
-
-def _inflate(stored: memoryview, compression: str, size: int) -> bytes:
-    """The `size` bytes that a chunk declares; never takes memory for more.
-
-    They may be in several frames; what is behind these is nobody's.
-    """
-    if compression == '':
-        return bytes(stored)
-    if size > _MOST.get(compression, size) * len(stored):
-        raise ValueError(f'{len(stored)} bytes cannot stand for {size}')
-    if compression == 'zstd':
-        # The frame's own size, if it has one, goes before max_output_size.
-        declared = zstandard.frame_content_size(stored)
-        if declared > size:
-            raise ValueError(f'the frame declares {declared} bytes, the chunk {size}')
-        data = zstandard.ZstdDecompressor().decompress(stored, max_output_size=max(size, 1))
-        if len(data) >= size:
-            return data
-        with zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True) as whole:
-            return whole.read(size + 1)
-    if compression == 'lz4':
-        parts = []
-        while size > 0 or not parts:
-            decompressor = lz4.frame.LZ4FrameDecompressor()
-            parts.append(decompressor.decompress(stored, max_length=size + 1))
-            if not decompressor.eof:
-                raise ValueError('the frame is not complete')
-            size, stored = size - len(parts[-1]), decompressor.unused_data or b''
-        return b''.join(parts)
-    raise ValueError('the compression is zstd, lz4 or none')
-
-
 def records(data: bytes, declared: Declared) -> Iterator[Message]:
     """The messages that are asked for among records; declarations are noted."""
     at, end, chosen, size = 0, len(data), declared.chosen, MESSAGE_FIELDS.size
+    read = declared.read
     while at < end:
         if data[at] == MESSAGE and end - at >= size:
             _, length, channel, sequence, log_time, publish_time = (
@@ -336,6 +279,7 @@ def records(data: bytes, declared: Declared) -> Iterator[Message]:
                 raise Damage(declared.unknown(channel))
             connection = chosen[channel]
             if connection is not None:
+                read[channel] += 1
                 yield Message(connection, sequence, log_time, publish_time, data[at:stop])
             at = stop
             continue

@@ -86,6 +86,11 @@ class Bag:
         return sum(known) if len(known) == len(self.files) else None
 
     @property
+    def surplus(self) -> int:
+        """Messages that were read and that the files do not count."""
+        return sum(file.surplus for file in self.files)
+
+    @property
     def notes(self) -> list[str]:
         """What is no damage and worth knowing, after reading with `strict=False`."""
         notes: list[str] = []

@@ -51,6 +51,7 @@ class Chunks:
     def __init__(self):
         self._offsets, self._starts, self._sets = array('Q'), array('Q'), array('I')
         self._numbers: dict[frozenset[int], int] = {frozenset(): 0}  # of the sets of channels
+        self._held: list[frozenset[int]] = []  # the sets by number
         self._members = 0
         self._skipped: frozenset[int] = frozenset()  # numbers of sets
         self._ahead: array[int] | None = None
@@ -105,6 +106,14 @@ class Chunks:
         """The earliest time [ns] in the chunk at a place and in those behind it; None: unknown."""
         return self._ahead[bisect.bisect_left(self._offsets, at)] if at in self else None
 
+    def held(self, at: int) -> frozenset[int]:
+        """The channels of the messages in the chunk at a place; empty: unknown."""
+        if at not in self:
+            return frozenset()
+        if len(self._held) != len(self._numbers):
+            self._held = list(self._numbers)
+        return self._held[self._sets[bisect.bisect_left(self._offsets, at)]]
+
     def __contains__(self, at: int) -> bool:
         number = bisect.bisect_left(self._offsets, at)
         return number < len(self) and self._offsets[number] == at
@@ -131,6 +140,7 @@ class Summary:
         self.chunks = Chunks()
         self.counts: dict[int, int] | None = None  # messages by channel
         self.total: int | None = None  # messages
+        self.span: tuple[int, int] | None = None  # ns, of the first and last message
         self.data_end: int | None = None  # where the summary or the footer begins
         self.data_crc = 0  # of what is before `data_mark`
         self.data_mark: int | None = None  # where the record is that ends the data
@@ -189,7 +199,9 @@ class Summary:
         elif opcode == CHANNEL:
             self.declared.channel(fields)
         elif opcode == STATISTICS:
-            self.total, *_ = fields.numbers('<QHIIIIQQ')
+            self.total, *_, first, last = fields.numbers('<QHIIIIQQ')
+            if 0 < last >= first:
+                self.span = first, last
             self.counts = dict(struct.iter_unpack('<HQ', pairs(fields)))
             if self.total and not self.counts:  # not available
                 self.counts = None
@@ -197,6 +209,14 @@ class Summary:
             first, last, offset, _ = fields.numbers('<QQQQ')
             held = frozenset(k for k, _ in struct.iter_unpack('<HQ', pairs(fields)))
             self.chunks.add(offset, first if first <= last else MAX_TIME, held)
+
+
+def peek(file: BinaryIO, at: int, size: int) -> bytes:
+    """The bytes at a place, at most so many; none where the size is not positive."""
+    if size <= 0:  # the place may be none that a file can have
+        return b''
+    file.seek(at)
+    return file.read(size)
 
 
 def crc_of(file: BinaryIO, start: int, size: int, crc: int = 0) -> int:

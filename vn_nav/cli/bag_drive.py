@@ -1,4 +1,4 @@
-"""What `vn_nav bag drive` does, and what it prints."""
+"""`vn_nav bag drive`: what a policy would have done along a recorded drive."""
 
 from __future__ import annotations
 

@@ -138,9 +138,9 @@ def choose_parts(drives: Drives, asked: Sequence[str] | None, own: Sequence[str]
     return tuple(parts), words
 
 
-def pretrain(network: Policy, drives: Drives, parts: Sequence[str], told: Split, folder: Path,
-             config: PretrainConfig, *, info: dict, resume: bool = False,
-             on_epoch: Callable[[dict], None] | None = None) -> Path:
+def pretrain_network(network: Policy, drives: Drives, parts: Sequence[str], told: Split,
+                     folder: Path, config: PretrainConfig, *, info: dict, resume: bool = False,
+                     on_epoch: Callable[[dict], None] | None = None) -> Path:
     """Train a network on drives, and keep the weights of the epoch that does best on the others.
 
     Repeats itself bit for bit when it was interrupted and resumed (one thread).

@@ -1,0 +1,46 @@
+"""`vn_nav collect`: pictures from random poses as a bag, for pre-training."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from vn_nav.cli.world import add_world, check_backend
+from vn_nav.errors import UserError
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of `vn_nav collect`."""
+    add_world(parser)
+    parser.add_argument('--houses', type=int, metavar='N', help='the first N training houses')
+    parser.add_argument('--pictures', type=int, default=20_000,
+                        help='in all (thesis, 5.7: 20,000)')
+    parser.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
+    parser.add_argument('--threads', type=int, default=1, help='that draw')
+    parser.add_argument('--out', type=Path, required=True, help='folder of the bag')
+
+
+def run(args: argparse.Namespace) -> int:
+    """`vn_nav collect`."""
+    check_backend(args.backend)
+    from vn_nav.bags.storage.writer import BagWriter
+    from vn_nav.robot import RobotSpec, load_robot
+    from vn_sim_bridge.datasets.collect import collect, house_scenes
+    from vn_sim_bridge.houses.splits import SPLITS
+    from vn_sim_bridge.render.randomisation import load_randomisation
+    if args.house and args.houses:
+        raise UserError('pictures are of named houses or of the first N', '--house and --houses',
+                        'give one of them')
+    count = 1 if args.houses is None else max(args.houses, 0)
+    houses = args.house or list(SPLITS['train'][:count])
+    robot = load_robot(args.robot) if args.robot else RobotSpec()
+    scenes = house_scenes(houses, args.rooms, args.size, robot,
+                          load_randomisation(args.randomisation), args.seed, args.threads)
+    begun = time.monotonic()
+    done = collect(scenes, len(houses), args.pictures, robot,
+                   lambda topics: BagWriter(args.out, topics))
+    seconds = time.monotonic() - begun
+    print(f'{args.out}: {done.pictures:,} pictures in {done.episodes:,} episodes of {done.scenes} '
+          f'house{"s" * (done.scenes > 1)}, {done.pictures / seconds:,.0f} pictures/s')
+    return 0

@@ -1,0 +1,89 @@
+"""Options that several commands share, and what becomes of them."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vn_nav.errors import UserError
+
+
+def add_place_options(parser: argparse.ArgumentParser) -> None:
+    """How pictures become a place."""
+    from vn_nav.bags.mapping.recorded_place import GOALS
+    parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
+    parser.add_argument('--margin', type=float, metavar='M',
+                        help='beside the driven path that counts as free [m]; default 0.3')
+    parser.add_argument('--straighten', action=argparse.BooleanOptionalAction, default=True,
+                        help='correct odometry by the places that the drive shows twice '
+                        '(docs/bags.md)')
+    parser.add_argument('--pictures', metavar='A-B[,C-D]', help='numbers of those to learn from; '
+                        'several ranges: you vouch for their odometry being in one frame')
+    parser.add_argument('--goals', type=int, default=GOALS, help='pictures to drive to, at most')
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags; '
+                        'default: `decoded` in the folder of a run, or none')
+
+
+def given_place_options(args: argparse.Namespace) -> list[str]:
+    """Names of those that differ from their default."""
+    from vn_nav.bags.mapping.recorded_place import GOALS
+    given = {'--topics': args.topics, '--margin': args.margin, '--cache': args.cache,
+             '--pictures': args.pictures,
+             '--no-straighten': None if args.straighten else True,
+             '--goals': None if args.goals == GOALS else args.goals}
+    return [name for name, value in given.items() if value is not None]
+
+
+def place_options(args: argparse.Namespace):
+    """The `PlaceOptions` of a command line.
+
+    Raises:
+        UserError: values that no drive is a place with.
+    """
+    from vn_nav.bags.mapping.recorded_place import PlaceOptions
+    from vn_nav.bags.roles import Topics, load_topics
+    return PlaceOptions(topics=load_topics(args.topics) if args.topics else Topics(),
+                        margin=args.margin, straighten=args.straighten,
+                        pictures=args.pictures or '', goals=args.goals)
+
+
+def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
+    """Numbers of `TrainConfig` by name, of the texts NAME=VALUE.
+
+    Raises:
+        UserError: a text of another form, or an unknown name.
+    """
+    from vn_nav.learning.presets import TrainConfig
+    known = {field.name: field.default for field in dataclasses.fields(TrainConfig)}
+    changes: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition('=')
+        if not equals or name not in known:
+            raise UserError('--set takes NAME=VALUE with a number of TrainConfig', text,
+                            f'the names are {", ".join(sorted(known))}')
+        try:
+            changes[name] = ast.literal_eval({'true': 'True', 'false': 'False'}.get(value, value))
+        except (ValueError, SyntaxError):
+            changes[name] = value
+        if isinstance(known[name], str):
+            changes[name] = value  # a word, whatever it looks like
+    return changes
+
+
+def check_folders(*files: Path | None) -> None:
+    """Refuse files whose folder does not exist."""
+    for file in files:
+        if file is not None and not file.absolute().parent.is_dir():
+            raise UserError('a file is written into a folder that exists', str(file),
+                            'make the folder, or choose another place')
+
+
+def command_words() -> str:
+    """This command as somebody would repeat it."""
+    return 'vn_nav ' + shlex.join(word for word in sys.argv[1:] if word != '--resume')

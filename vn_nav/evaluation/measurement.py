@@ -1,0 +1,147 @@
+"""`evaluate`: figures of a checkpoint in the environments of some splits."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from vn_nav.errors import UserError
+from vn_nav.evaluation import evaluator
+from vn_nav.policy.checkpoint import LoadedCheckpoint
+from vn_nav.policy.checkpoint_info import DECODINGS
+from vn_nav.robot import RobotSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateConfig:
+    """How a checkpoint is measured.
+
+    Raises:
+        UserError: values outside their range.
+    """
+
+    episodes: int = 100  # of a row at least; the same number in each house
+    seed: int = 10_000  # of environments and sampled actions
+    decoding: str | None = None  # sample or greedy; None: as the checkpoint was measured
+    controls: tuple[str, ...] = evaluator.CONTROLS  # on the same starts
+    # Probability above which the arrival head declares a stop; None: the checkpoint's.
+    stop_threshold: float | None = None
+    robot: RobotSpec | None = None  # for durations; None: the standard robot
+
+    def __post_init__(self):
+        threshold = self.stop_threshold
+        rules = (
+            (self.episodes >= 1, 'there is at least one episode', self.episodes,
+             'raise --episodes'),
+            (threshold is None or 0 <= threshold < 1, 'the stop threshold lies in [0, 1)',
+             threshold, 'choose a value in range'),
+            (self.decoding in (None, *DECODINGS), f'decoding is one of {", ".join(DECODINGS)}',
+             self.decoding, 'choose one'),
+            (set(self.controls) <= set(evaluator.CONTROLS),
+             f'controls are some of {", ".join(evaluator.CONTROLS)}', self.controls,
+             'choose some of them'),
+        )
+        for kept, rule, received, remedy in rules:
+            if not kept:
+                raise UserError(rule, received, remedy)
+
+
+@dataclasses.dataclass
+class Evaluation:
+    """What was measured.
+
+    Attributes:
+        result: figures by split, kind of stop and row; JSON has what it holds.
+        measured: the episodes, by split.
+        plans: floor plans of the houses by seed, by split.
+    """
+
+    result: dict
+    measured: dict[str, evaluator.Rows]
+    plans: dict[str, dict[int, Any]]
+
+
+def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions: int,
+               decoding: str, seed: int) -> dict:
+    """A result without splits: what all of them have in common.
+
+    Args:
+        info: of the checkpoint; its `sha256` is left out where the weights still change.
+        checkpoint: its name.
+        bag: name of the recorded drive; None: simulated houses.
+        max_decisions: of an episode.
+        decoding: 'sample' or 'greedy'.
+        seed: of the episodes.
+    """
+    return {'checkpoint': checkpoint,
+            **({'sha256': info['sha256']} if 'sha256' in info else {}),
+            'bag': bag, 'world_version': info['world_version'], 'task': info['task'],
+            'decoding': decoding, 'max_decisions': max_decisions, 'seed': seed,
+            'date': datetime.date.today().isoformat(), 'splits': {}}
+
+
+def split_result(houses: Sequence[int], measured: evaluator.Rows) -> dict:
+    """One split of a result: its figures, and those of each house alone."""
+    scenes = evaluator.by_scene(measured)
+    return {'houses': list(houses), 'rows': evaluator.figures(measured),
+            'scenes': {str(seed): evaluator.figures(scenes[seed]) for seed in houses}}
+
+
+def measure_checkpoint(checkpoint: LoadedCheckpoint, houses: Sequence[int], make_env: Callable,
+                       config: EvaluateConfig) -> evaluator.Rows:
+    """Episodes of a checkpoint in some houses; see `evaluator.measure`."""
+    info, controls = checkpoint.info, config.controls
+    if info['task'] == 'collect':  # no goal: none to show wrong, and no shortest path to it
+        controls = tuple(name for name in controls
+                         if name in (evaluator.OTHER, evaluator.RANDOM))
+    return evaluator.measure(
+        make_env, checkpoint.network, houses, known=info['houses'],
+        decoding=config.decoding or info['decoding'], episodes=config.episodes,
+        controls=controls, seed=config.seed, robot=config.robot,
+        threshold=(info.get('stop_threshold') if config.stop_threshold is None
+                   else config.stop_threshold))
+
+
+def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[int]],
+             make_env: Callable, config: EvaluateConfig | None = None, *, name: str = '',
+             bag: str | None = None,
+             on_split: Callable[[str, dict], None] = lambda split, result: None) -> Evaluation:
+    """Measure a checkpoint and its controls in every split.
+
+    Args:
+        checkpoint: the policy.
+        splits: seeds of the houses by the split's name.
+        make_env: (split, houses, environments, stop) -> vector environment in which environment
+            i lives in house i modulo their number; `stop` is 'arrival' or 'declared'.
+        config: numbers; None: the defaults.
+        name: of the checkpoint, for the result.
+        bag: name of the recorded drive that the environments are made of; None: houses.
+        on_split: called with the name and the whole result after each split.
+
+    Raises:
+        UserError: no split.
+    """
+    config = config or EvaluateConfig()
+    if not splits:
+        raise UserError('there is a split to measure in', dict(splits), 'name one')
+    done = Evaluation({}, {}, {})
+    for split, houses in splits.items():
+        plans = done.plans[split] = {}
+        limits: list[int] = []
+
+        def make(seeds: Sequence[int], environments: int, stop: str, split: str = split,
+                 plans: dict = plans, limits: list[int] = limits):
+            env = make_env(split, seeds, environments, stop)
+            plans.update({house.seed: house.floor_plan() for house in env.houses})
+            limits.append(env.config.max_decisions)
+            return env
+
+        measured = done.measured[split] = measure_checkpoint(checkpoint, houses, make, config)
+        done.result = done.result or new_result(
+            checkpoint.info, checkpoint=name, bag=bag, max_decisions=limits[0],
+            decoding=config.decoding or checkpoint.info['decoding'], seed=config.seed)
+        done.result['splits'][split] = split_result(houses, measured)
+        on_split(split, done.result)
+    return done

@@ -1,0 +1,229 @@
+"""What a robot behind topics sees and is told: pictures, goals, rewards, the ends of episodes."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import hashlib
+import json
+import math
+import threading
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Bool, Float32, String, UInt8
+
+from vn_msgs_py import images
+from vn_nav.bags.stamped import WINDOW
+from vn_nav.nodes.command_output import CommandOutput
+from vn_nav.nodes.recorded_topics import RecordedTopics
+from vn_nav.observation import needed_side, preprocess, preprocess_map
+from vn_nav.policy.frame_gate import shorten
+from vn_nav.policy.goal_watch import GoalWatch
+from vn_nav.policy.navigator import Navigator
+from vn_nav.robot import RobotSpec
+
+# Beside the picture, by the key of `info`: topic and decoder.
+BESIDE = {'depth': ('depth/image_raw', images.decode_depth),
+          'segmentation': ('labels/image_raw', images.decode_labels)}
+
+
+class Seen(NamedTuple):
+    """What the robot sees at rest."""
+
+    picture: np.ndarray  # [3,S,S] uint8
+    beside: dict[str, np.ndarray]  # [S,S] depth [m], 0 where unknown; segmentation class ids
+
+
+@dataclasses.dataclass
+class Tally:
+    """What was said on topics since the last decision."""
+
+    reward: float = 0.0
+    judged: bool = False  # somebody said something on `reward`
+    collided: bool = False
+    arrived: bool = False
+    end: int = 0
+
+
+class Senses:
+    """Subscriptions of one robot; callbacks keep the newest of each, and count what was said.
+
+    Args:
+        node: that subscribes.
+        topics: its subscriptions.
+        navigator: judges stamps and goals.
+        output: takes odometry.
+        wake: guards everything below, and wakes all threads.
+        robot: whose camera the pictures are cropped to.
+        size: side of the pictures [pixels].
+        lock_step: stamps are the simulator's ticks, and nothing is late.
+        compressed: pictures come on image_raw/compressed.
+
+    Attributes:
+        goal: the goal picture in force [3,S,S]; None: none yet.
+        goals: number of goals that were taken.
+        scene: what a simulator says of itself; empty: nobody does.
+        camera_fov: of the pictures [rad]; None: nobody has said.
+        frame: stamp [s] and picture, the newest of the present goal.
+        tally: what was said since the last decision.
+    """
+
+    def __init__(self, node: Node, topics: RecordedTopics, navigator: Navigator,
+                 output: CommandOutput, wake: threading.Condition, robot: RobotSpec, size: int, *,
+                 lock_step: bool, compressed: bool):
+        self._node, self._topics, self._navigator, self._wake = node, topics, navigator, wake
+        self._robot, self._size, self._lock_step = robot, size, lock_step
+        self._goal_watch = GoalWatch(trust_stamps=lock_step)
+        self._beside: dict[str, collections.deque] = {}  # (stamp, message) by key
+        self.goal: np.ndarray | None = None
+        self.goals = 0
+        self.scene: dict = {}
+        self.camera_fov: float | None = None
+        self.frame: tuple[float, np.ndarray] | None = None
+        self.tally = Tally()
+        # Outcomes come first: of what has arrived, the executor serves the oldest subscription
+        # first, and so the outcome of a decision before the picture that follows it.
+        topics.hear(Float32, 'reward', self._on_reward, history=False)
+        topics.hear(Bool, 'collision', self._on_collision, history=False)
+        topics.hear(Bool, 'arrived', self._on_arrived, history=False)
+        topics.hear(UInt8, 'episode_end', self._on_episode_end, history=False)
+        topics.hear(String, 'scene', self._on_scene)
+        topics.hear(Image, 'goal_image', self._on_goal, anybody=True)
+        # In lock-step no odometry may be missed, and the simulator is reliable.
+        topics.hear(Odometry, 'odom', output.take_odometry, anybody=not lock_step)
+        topics.hear(CameraInfo, 'camera_info', self._on_camera_info)
+        topics.hear(*((CompressedImage, 'image_raw/compressed') if compressed else
+                      (Image, 'image_raw')), self._on_image)
+
+    def listen(self, keys: tuple[str, ...]) -> None:
+        """Have these keys of `BESIDE` beside every picture."""
+        for key in keys:
+            self._beside[key] = collections.deque(maxlen=16)
+
+            def keep(message, rows=self._beside[key]) -> None:
+                with self._wake:
+                    rows.append((_seconds(message.header.stamp), message))
+                    self._wake.notify_all()
+            self._topics.hear(Image, BESIDE[key][0], keep)
+
+    def offers(self) -> set[str]:
+        """The keys of `BESIDE` that somebody publishes."""
+        return {key for key, (name, _) in BESIDE.items() if self._node.count_publishers(name)}
+
+    # Callbacks, on the executor's thread.
+
+    def _on_image(self, message) -> None:
+        received = time.monotonic()
+        stamp = _seconds(message.header.stamp)
+        with self._wake:
+            # In lock-step stamps are the simulator's ticks and nothing is late.
+            if not self._navigator.admit(stamp, None if self._lock_step else self._now()):
+                return
+        try:
+            picture = self._prepare(message)
+        except Exception as error:  # whatever is wrong with it: as good as no picture
+            with self._wake:
+                self._navigator.bad_frame(str(error) or repr(error), time.monotonic())
+                self._wake.notify_all()
+            return
+        with self._wake:
+            self._navigator.good_frame(received)
+            self.frame = (stamp, picture)
+            self._wake.notify_all()
+
+    def _on_goal(self, message: Image) -> None:
+        stamp = message.header.stamp
+        content = hashlib.blake2b(message.data, digest_size=16).digest()
+        with self._wake:
+            if not self._goal_watch.is_new((stamp.sec, stamp.nanosec), content, time.monotonic()):
+                return
+            self._navigator.new_goal()
+        try:
+            picture = self._prepare(message)
+        except Exception as error:  # whatever is wrong with it: a picture moves no robot
+            self._node.get_logger().error(f'goal_image refused: {shorten(str(error))}')
+            with self._wake:
+                self._navigator.refuse_goal(str(error))
+            return
+        with self._wake:
+            # Pictures up to then belong to the episode before.
+            self._navigator.accept_goal(_seconds(stamp) if self._lock_step else
+                                        self._now() + self._navigator.limits.settle_time)
+            self.goal, self.frame = picture, None
+            self.goals += 1
+            self._wake.notify_all()
+
+    def _on_reward(self, message: Float32) -> None:
+        if not math.isfinite(message.data):
+            self._node.get_logger().error(f'a reward is finite; received {message.data}')
+            return
+        with self._wake:
+            self.tally.reward += message.data
+            self.tally.judged = True
+            self._wake.notify_all()
+
+    def _on_collision(self, message: Bool) -> None:
+        with self._wake:
+            self.tally.collided |= message.data
+
+    def _on_arrived(self, message: Bool) -> None:
+        with self._wake:
+            self.tally.arrived |= message.data
+
+    def _on_episode_end(self, message: UInt8) -> None:
+        with self._wake:
+            self.tally.end = message.data
+
+    def _on_scene(self, message: String) -> None:
+        try:
+            said = json.loads(message.data)
+        except ValueError:  # another kind of scene
+            return
+        if isinstance(said, dict):
+            self.scene = said
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        side, focal = min(message.width, message.height), message.k[0]
+        if side > 0 and math.isfinite(focal) and focal > 0:
+            self.camera_fov = 2 * math.atan(side / 2 / focal)
+
+    def sees(self) -> bool:
+        """Whether there is a picture to decide on, and what belongs beside it."""
+        return (self.frame is not None and self._navigator.wants(self.frame[0])
+                and all(_nearest(rows, self.frame[0]) for rows in self._beside.values()))
+
+    def look(self) -> Seen:
+        """The newest picture, and what belongs beside it."""
+        stamp, picture = self.frame
+        beside = {}
+        for key, rows in self._beside.items():
+            decoded = BESIDE[key][1](_nearest(rows, stamp))
+            beside[key] = np.nan_to_num(preprocess_map(decoded, self._size, **self._lens()))
+        return Seen(picture, beside)
+
+    def _prepare(self, message) -> np.ndarray:
+        lens = self._lens()
+        smallest = needed_side(self._size, **lens)
+        return preprocess(images.decode_rgb(message, smallest), self._size, **lens)
+
+    def _lens(self) -> dict[str, float]:
+        return {} if self.camera_fov is None else {
+            'fov': self.camera_fov, 'target_fov': self._robot.camera_fov}
+
+    def _now(self) -> float:
+        return self._node.get_clock().now().nanoseconds * 1e-9
+
+
+def _seconds(stamp) -> float:
+    return stamp.sec + stamp.nanosec * 1e-9
+
+
+def _nearest(rows: collections.deque, stamp: float) -> Any:
+    """The message nearest to a stamp, within `WINDOW`; None: there is none."""
+    near = min(rows, key=lambda row: abs(row[0] - stamp), default=None)
+    return near[1] if near is not None and abs(near[0] - stamp) <= WINDOW else None
