@@ -34,6 +34,7 @@ CAMERA_LOSSES = 200 if LONG else 6
 SIGNALS = 100 if LONG else 4
 MUTATED_MESSAGES = 100_000 if LONG else 1_000
 PARAMETER_SETS = 1_000 if LONG else 100
+WARM = 120 if LONG else 5  # s of driving until the memory of caches is full
 MINUTES = float(os.environ.get('VN_NAV_MINUTES', 60)) if LONG else 0.5
 
 
@@ -241,20 +242,25 @@ def test_an_hour_of_driving(make_robot, checkpoint, tmp_path):
     """Driving on and on, goal after goal: nothing grows, nothing stops."""
     robot = make_robot((640, 480), odometry=RELIABLE)
     with child(NODE, tmp_path / 'log', checkpoint=checkpoint) as process:
+        def alive():
+            """It runs, and no stop is latched; else why."""
+            said = [line for line in (tmp_path / 'log').read_text().splitlines()
+                    if 'stopped' in line]
+            assert process.poll() is None, said
+            assert robot.statuses[-1][3]['state'] != 'stopped', (os.getloadavg(), said)
+
         robot.drive()
-        robot.spin_for(20 if LONG else 5)  # caches are warm
+        robot.spin_for(WARM)
         begun, first = time.monotonic(), resident(process)
         readings, goal = [], 0.0
         while time.monotonic() - begun < 60 * MINUTES:
             robot.spin_for(5)
+            alive()
             readings.append((time.monotonic() - begun, resident(process)))
             robot.commands, robot.statuses = robot.commands[-100:], robot.statuses[-20:]
             if time.monotonic() - goal > 60:
                 goal = time.monotonic()
                 robot.show_goal(len(readings))
-        assert process.poll() is None and robot.statuses[-1][3]['state'] != 'stopped', (
-            robot.statuses[-1], [line for line in (tmp_path / 'log').read_text().splitlines()
-                                 if 'stopped' in line])
     grown = (max(rss for _, rss in readings[-3:]) - first) / 2**20
     figure('memory grown by driving', [grown], 'MiB', minutes=MINUTES,
            by_reading=[round((rss - first) / 2**20, 1) for _, rss in readings[::12]],
