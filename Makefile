@@ -68,6 +68,7 @@ lint: $(READY)
 	@report=$$($(BIN)/ament_flake8 $(SOURCES) 2>&1) || { echo "$$report"; exit 1; }
 	@report=$$($(BIN)/ament_pep257 --convention google --add-ignore D101 D102 D103 D105 D107 D417 --\
 	 $(SOURCES) 2>&1) || { echo "$$report"; exit 1; }
+	@for python in 3.11 3.12; do $(BIN)/python -m mypy --python-version $$python || exit 1; done
 
 # Strict: a link that leads nowhere, or a docstring that cannot be read, is an error.
 docs: $(READY_DOCS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numbers
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from vn_nav.errors import UserError
 MAX_SEED = (1 << 63) - 1
 
 
-def read_seed(seed: object) -> int | None:
+def read_seed(seed: Any) -> int | None:
     """A seed as Python's integer; None stays None.
 
     Raises:
@@ -28,7 +29,7 @@ def are_several(seed: object) -> bool:
     return np.ndim(np.asarray(seed, object)) > 0
 
 
-def read_seeds(seed: object, count: int) -> list[int | None]:
+def read_seeds(seed: Any, count: int) -> list[int | None]:
     """The seeds of environments, one each, out of a sequence or an array.
 
     Raises:
@@ -56,6 +57,6 @@ def read_options(options: object, known: Sequence[str] = ()) -> Mapping:
     return options or {}
 
 
-def _is_seed(value: object) -> bool:
+def _is_seed(value: Any) -> bool:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool) and (
-        0 <= value <= MAX_SEED)
+        0 <= int(value) <= MAX_SEED)

@@ -127,7 +127,7 @@ def replaced(role: str, kinds: Mapping[str, str]) -> bool:
         kinds: types of the topics that are there, by their roles.
     """
     other = {'odometry': 'command', 'command': 'odometry'}.get(role)
-    return other in kinds and fits(other, kinds[other])
+    return other is not None and other in kinds and fits(other, kinds[other])
 
 
 def remedy(role: str, recorded: Mapping[str, str], stand_in: bool = False) -> str:

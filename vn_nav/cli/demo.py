@@ -234,7 +234,7 @@ def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint) -> dict:
 
 def _paired(recorded: list[RecordedEpisode], in_process: list[Episode]) -> dict:
     """Success and decisions over ROS minus those without it, on the same starts; 95 %."""
-    found = {}
+    found: dict[str, float | list[float]] = {}
     for name in ('success', 'decisions'):
         differences = [float(getattr(one.episode, name)) - float(getattr(two, name))
                        for one, two in zip(recorded, in_process, strict=True)]

@@ -76,4 +76,4 @@ def _stop_threshold(checkpoint, args: argparse.Namespace) -> float:
         success[threshold] = row['success']
         print(f'declaring above {threshold:.0%}: success {row["success"]:.2f}, false stops '
               f'{row["false_stops"]:.2f}', flush=True)
-    return max(success, key=success.get)
+    return max(success, key=success.__getitem__)

@@ -106,7 +106,8 @@ def summarise(episodes: Sequence[Episode]) -> dict:
             'false_stops': float(np.mean([e.declared and not e.success for e in episodes])),
             'reached': float(np.mean([e.reached for e in episodes])),
         }
-    if all(e.filtered is not None for e in episodes):
-        figures |= {name: sum(e.filtered[k] for e in episodes) / max(decisions, 1)
+    filtered = [e.filtered for e in episodes if e.filtered is not None]
+    if len(filtered) == len(episodes):
+        figures |= {name: sum(counts[k] for counts in filtered) / max(decisions, 1)
                     for k, name in enumerate(('filter_acted', 'filter_changed'))}
     return figures

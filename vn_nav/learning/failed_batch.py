@@ -16,7 +16,7 @@ from vn_nav.policy.network import Policy
 
 
 def give_up(path: Path | None, network: Policy, batch: Rollout, advantage: Tensor, target: Tensor,
-            figures: dict[str, Tensor], replayed: dict[str, object]) -> None:
+            figures: dict[str, Tensor], replayed: dict[str, Rollout | dict]) -> None:
     """Leave what the step was computed from, and end the training.
 
     `torch.load(path)` gives plain values and tensors: `batch` (the fields of `Rollout`, one

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection
+from typing import Any
 
 from vn_nav.errors import UserError
 from vn_nav.learning.learner_config import PRIVILEGED
@@ -51,7 +52,8 @@ def config_over_ros(config: TrainConfig, world: dict, offers: Collection[str], l
         words.append('there is no curriculum: robots start where they are')
     if config.pair_minutes:
         words.append("there are no picture pairs: they are the simulator's")
+    without: dict[str, Any] = dict.fromkeys(lost, 0.0)
     return dataclasses.replace(
-        config, **dict.fromkeys(lost, 0.0), teacher_share=0.0, pair_minutes=0.0,
+        config, **without, teacher_share=0.0, pair_minutes=0.0,
         start_difficulty=1.0, extra_heads=(*config.extra_heads, *(
             name for name in lost if name != 'imitation'))), words

@@ -84,11 +84,11 @@ def pretrain(job: PretrainJob, *, say: Callable[[str], None] = print_line) -> Pa
     Raises:
         UserError: options, bags or a checkpoint that do not fit; see `pretrain_network` as well.
     """
-    numbers, out = job.numbers, Path(job.out)
+    numbers, out, bags = job.numbers, Path(job.out), [*map(Path, job.bags)]
     given = load_checkpoint(job.init) if job.init else None
     train = _train_config(job, given)
     robot, network = _robot_and_network(job, given, train)
-    drives, worlds = load_bags(job.bags, robot, network.size, job.topics,
+    drives, worlds = load_bags(bags, robot, network.size, job.topics,
                                Path(job.cache or out / 'decoded'), say)
     parts, words = choose_parts(drives, job.heads, network.heads, job.cloning)
     told = split(drives, numbers.validation_share, numbers.seed)
@@ -101,7 +101,7 @@ def pretrain(job: PretrainJob, *, say: Callable[[str], None] = print_line) -> Pa
         'world_version': worlds.pop() if len(worlds) == 1 else RECORDED,
         'camera_fov_deg': math.degrees(robot.camera_fov), 'camera_height': robot.camera_height,
         'preset': train.preset, 'command': job.command,
-        'data': _data(job.bags, drives, told, job.init),
+        'data': _data(bags, drives, told, Path(job.init) if job.init else None),
         'notes': f'Pre-trained on {len(drives):,} steps of {len(job.bags)} bag'
                  f'{"s" * (len(job.bags) > 1)}: {", ".join(parts).replace("_", " ")}; '
                  f'{told.words}. Losses and figures are of these recorded steps, not of driving; '

@@ -82,7 +82,7 @@ class Replay:
         self.device = torch.device(device)
         self.resumed: str | None = None
         self.total = self.count = 0  # rows ever appended; readable ones, the newest of them
-        self._steps: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        self._steps: dict[int, tuple[Tensor, Tensor]] = {}
         layout = self._layout(capacity, num_envs, size, self.privileged)
         self._files = (None if directory is None
                        else RingFiles(Path(directory), self._header()))
@@ -283,8 +283,8 @@ class Replay:
             # Of an episode whose beginning was overwritten, the oldest rows lack predecessors.
             step &= (row >= age.clamp(max=frames - 1))[:-1]
             rewarded = self.rings['last_reward'][order[1:]] != 0
-            self._steps[frames] = tuple(
-                kind.flatten().nonzero()[:, 0] for kind in (step & ~rewarded, step & rewarded))
+            self._steps[frames] = ((step & ~rewarded).flatten().nonzero()[:, 0],
+                                   (step & rewarded).flatten().nonzero()[:, 0])
         return self._steps[frames]
 
     def _draw(self, steps: Tensor, number: int, generator: torch.Generator
@@ -333,7 +333,7 @@ class Replay:
         self.resumed = 'refilled'
         if not self.identity or not state['total']:
             return
-        if state['identity'] != self.identity:
+        if self._files is not None and state['identity'] != self.identity:
             raise UserError('a training goes on with its own replay files',
                             f'files of {self.identity} in {self._files.directory}',
                             'remove that folder: the memory is then filled anew')

@@ -153,11 +153,12 @@ class Collector:
                 for key, rows in self.told.items()}
         driven = None if teacher is None else empty(steps, flag)
         chosen, value = empty(steps, real), empty(steps + 1, real)
+        offsets = None if self._filter is None else empty(
+            steps, real, len(self.network.config.actions))
         rollout = Rollout(
             seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
             empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, told,
-            driven, chosen, value, None if self._filter is None else empty(
-                steps, real, len(self.network.config.actions)))
+            driven, chosen, value, offsets)
         facts = empty(steps, torch.float64, 1 + len(self._totals))
         goal_maps = self._goal_maps()
         for t in range(steps + 1):
@@ -182,10 +183,10 @@ class Collector:
                 break  # this observation only bootstraps; the next rollout begins with it
             self.state = state
             logits = output.logits[0]
-            if self._filter is not None:
-                rollout.filter_offsets[t] = self._filter.offsets(
+            if self._filter is not None and offsets is not None:
+                offsets[t] = self._filter.offsets(
                     image[t], seen.last_action[t], rollout.starts[t])
-                logits = logits + rollout.filter_offsets[t]
+                logits = logits + offsets[t]
             log_probability = torch.log_softmax(logits, dim=-1)
             action = self._sample(log_probability)
             if teacher is not None and driven is not None:

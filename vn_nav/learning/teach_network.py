@@ -38,6 +38,7 @@ def network_for_place(config: TrainConfig, robot: RobotSpec, size: int, seed: in
 @torch.no_grad()
 def blend(network: Policy, own: float) -> None:
     """Weigh what a policy thinks, which one that was taught before has weighed, and the advice."""
+    assert network.routes is not None  # it was made for a place
     for layer, share in ((network.actor, own), (network.routes.advise, ADVISED)):
         for part in layer.parameters():
             part *= share

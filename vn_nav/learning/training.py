@@ -68,7 +68,7 @@ class Training:
         if bags is not None:
             bags.attach(self.network, processes.rank)
         self.learner = Learner(self.network, config, self.generator, replay=self._replay(size),
-                               processes=processes, beside=bags and bags.loss)
+                               processes=processes, beside=None if bags is None else bags.loss)
         # All processes see that a gradient is not finite, whosever batch it came from.
         self.learner.failed_batch = folder / (
             f'{processes.rank}-{FAILED_BATCH}' if processes.count > 1 else FAILED_BATCH)
@@ -79,6 +79,7 @@ class Training:
             self.actor, self.drawn = copy.deepcopy(self.network), torch.Generator()
         self.ahead: tuple[Rollout, list[Episode]] | None = None  # collected, not yet learned from
         self.collector = Collector(env, self.actor, self.drawn, config.privileged)
+        self.curriculum: Curriculum | FrameCurriculum
         if config.curriculum == 'frames':
             self.curriculum = FrameCurriculum(start=config.start_difficulty)
         else:
@@ -210,13 +211,13 @@ class Training:
         everyone = self.processes.gather((
             rollout.frames, self.seconds + end - self.clock, losses, self.collector.number,
             [tuple(episode._replace(env=first + episode.env)) for episode in episodes]))
-        frames, seconds, losses, numbers, episodes = zip(*everyone, strict=True)
+        frames, seconds, parts, numbers, ended = zip(*everyone, strict=True)
         speed = sum(frames) / (end - self.clock)
         self.frames += sum(frames)
         self.updates += 1
         self.seconds = seconds[0]  # the same for all: they have to end together
         self.clock = end
-        episodes = [Episode(*episode) for part in episodes for episode in part]
+        episodes = [Episode(*episode) for part in ended for episode in part]
         self.recent.extend(episodes)
         tau, present = self.curriculum.tau, np.concatenate(numbers)
         if self.curriculum.update(episodes, present, self.progress):
@@ -225,7 +226,7 @@ class Training:
         # environment has ended one.
         shown = self.recent if present.min() > 1 else ()  # the first is number 1
         decisions = sum(episode.decisions for episode in shown) or math.nan
-        losses = {name: _mean(part[name] for part in losses) for name in losses[0]}
+        losses = {name: _mean(part[name] for part in parts) for name in parts[0]}
         return dict(zip(COLUMNS, (
             self.frames, self.seconds / 60, speed, tau,
             _mean(episode.success for episode in shown),

@@ -54,14 +54,16 @@ class RecordedTopics:
             last = this
             record(message, info)
             handle(message)
+        # rclpy also calls with what it knows of a message; its annotations have it without.
+        heard: Callable[..., None] = callback
         if anybody:
-            subscribe(self._node, kind, name, callback)
+            subscribe(self._node, kind, name, heard)
         else:
-            self._node.create_subscription(kind, name, callback, profile(
+            self._node.create_subscription(kind, name, heard, profile(
                 entry if history else dataclasses.replace(entry, durability=VOLATILE)))
 
-    def recording(self, name: str) -> Callable[[Any, dict], None]:
-        """A callback that records a topic."""
+    def recording(self, name: str) -> Callable[..., None]:
+        """A callback (message, info) that records a topic."""
         def record(message, info) -> None:
             self._record(name, message, info['source_timestamp'],
                          info.get('publication_sequence_number') or 0)

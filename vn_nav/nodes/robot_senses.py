@@ -199,6 +199,7 @@ class Senses:
 
     def look(self) -> Seen:
         """The newest picture, and what belongs beside it."""
+        assert self.frame is not None  # `sees` said so
         stamp, picture = self.frame
         beside = {}
         for key, rows in self._beside.items():

@@ -234,6 +234,7 @@ class RosRobot(Node):
             elsewhere = self._senses.goals != self._episode_goal
             cut = self.navigator.cut_off != self._cut_before
             seen = self._shown if elsewhere else self._senses.look()
+        assert seen is not None  # the decision was made at a picture
         success = said.reward > 0 or said.arrived
         terminated = success or said.end == TERMINATED
         limit = self._decisions >= self.max_decisions and not self.count_publishers('episode_end')
@@ -246,13 +247,13 @@ class RosRobot(Node):
     def halt(self) -> None:
         """End the output thread with a zero command that has been delivered; end the bag."""
         with self.wake:
-            running = self._running
-            if running:
-                self._threads.end()
+            threads = self._threads if self._running else None
+            if threads is not None:
+                threads.end()
             self.navigator.stop('the training ends', time.monotonic())
             self.wake.notify_all()
-        if running:
-            self._threads.join('output')  # it waits for nothing but `wake`
+        if threads is not None:
+            threads.join('output')  # it waits for nothing but `wake`
             self.output.deliver_zero()  # the output thread is gone: still only one owner
         self._topics.close()
 

@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import rclpy
 from rclpy.context import Context
@@ -25,6 +25,9 @@ ALONE = 3.0  # s in which others on a domain are heard of, also on a busy machin
 
 class Domain:
     """A ROS domain that nobody else is on, with a node of ours there; a context manager."""
+
+    number: int
+    _lock: IO[Any] | None  # of the file that keeps other shadows away
 
     def __init__(self, domains: Iterable[int]):
         self.namespace = f'/vn_nav_shadow_{os.getpid()}_{secrets.token_hex(4)}'
@@ -70,7 +73,8 @@ class Domain:
         self.executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()
-        self._lock.close()
+        if self._lock is not None:
+            self._lock.close()
 
     def __enter__(self) -> Domain:
         return self

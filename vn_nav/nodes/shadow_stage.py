@@ -164,7 +164,7 @@ class Stage:
         if event.decision is not None:
             self._decide(event, event.decision)
         elif event.picture:
-            self._show(event.data, event.stamp)
+            self._show(event.picture_data, event.stamp)
         else:
             self._pose = event.data or self._pose
             self._tick(event.stamp)
@@ -180,7 +180,7 @@ class Stage:
         self._out['executed_action'].publish(told)
         self._bag.write(in_bag('executed_action'), serialize_message(told), self._log_time)
         self._choice, begun = None, time.monotonic()
-        self._show(event.data, stamp)
+        self._show(event.picture_data, stamp)
         self._until(lambda: self._choice is not None, 'a decision', resend=True)
         self.latencies.append(time.monotonic() - begun)
         if self.latencies[-1] > SHADOW_LIMIT:  # the node has discarded it
@@ -227,7 +227,7 @@ class Stage:
         self._out['odom'].publish(stamped(self._pose, event.stamp))
         while True:
             stamp += step
-            self._image.publish(stamped(event.data, stamp))
+            self._image.publish(stamped(event.picture_data, stamp))
             if self._plan.camera_info is not None:
                 self._out['camera_info'].publish(stamped(self._plan.camera_info, event.stamp))
             self._domain.executor.spin_once(timeout_sec=0.03)

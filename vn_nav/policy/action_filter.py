@@ -22,13 +22,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 if TYPE_CHECKING:
     import torch
-    Array: TypeAlias = np.ndarray | torch.Tensor
+
+# NumPy's or torch's, which have in common what is used here; no type says so.
+Array: TypeAlias = Any
 
 NONE, BLOCKED_ACTIONS = FILTERS = ('none', 'blocked_actions')
 THUMBNAIL_SIDE = 8  # pixels of the small pictures that are compared, in which noise averages out
@@ -52,6 +54,11 @@ class BlockedActionFilter:
         num_envs: robots, N.
         device: of tensors; left out, it takes and gives NumPy arrays.
     """
+
+    _before: Array  # [N,192] float32 thumbnails
+    _heading: Array  # [N] rad, since the last move
+    _turned: Array  # [N] rad, either way added
+    _blocked: Array  # [N,A,72] bool
 
     def __init__(self, moves: Sequence[Sequence[float]], num_envs: int,
                  device: torch.device | str | None = None):

@@ -237,8 +237,8 @@ class BatchedPolicy:
         last_action, reset_mask = np.asarray(obs['last_action']), np.asarray(reset_mask, bool)
         observation = Observation(
             torch.from_numpy(obs['image'])[None], None, None,
-            *(torch.from_numpy(rows)[None]
-              for rows in (last_action, np.asarray(obs['last_reward']))), extras)
+            torch.from_numpy(last_action)[None],
+            torch.from_numpy(np.asarray(obs['last_reward']))[None], extras)
         starts = torch.from_numpy(reset_mask)[None]
         output, self._state = self.network(observation, starts, self._state, maps)
         if output.arrival is not None:
@@ -246,10 +246,10 @@ class BatchedPolicy:
         offsets = None
         if self._filter is not None:
             offsets = self._filter.offsets(obs['image'], last_action, reset_mask)
-        actions, self.logits, *filtered = choose_filtered(
+        actions, self.logits, acted, changed = choose_filtered(
             output.logits[0], offsets, self.decoding, self._generator)
         if self._filter is not None:
-            self.filtered = tuple(filtered)
+            self.filtered = acted, changed
         return actions.numpy()
 
 

@@ -89,16 +89,16 @@ def _poses(nodes: list[dict]) -> list[np.ndarray]:
                 raise ValueError(f'node {child!r} is the child of several nodes, or of none')
             parents[child] = index
     own = [_local(node) for node in nodes]
-    found: list[np.ndarray | None] = [None] * len(nodes)
+    found: dict[int, np.ndarray] = {}
     waiting = [index for index in range(len(nodes)) if index not in parents]
     while waiting:
         index = waiting.pop()
         above = parents.get(index)
         found[index] = own[index] if above is None else found[above] @ own[index]
         waiting.extend(nodes[index].get('children', ()))
-    if any(pose is None for pose in found):
+    if len(found) < len(nodes):
         raise ValueError('nodes are in a circle')
-    return found
+    return [found[index] for index in range(len(nodes))]
 
 
 def _local(node: dict) -> np.ndarray:

@@ -62,7 +62,7 @@ def read_obj(path: Path) -> Iterator[Part]:
     faces: dict[tuple, _Faces] = {}
     materials: dict[str, _Material] = {}
     libraries = 0
-    place = [None, None, None]  # object, group, material
+    place: list[str | None] = [None, None, None]  # object, group, material
     own = faces.setdefault(tuple(place), _Faces([], []))
     for number, line in _lines(path):
         word, _, rest = line.partition(' ')
@@ -199,11 +199,13 @@ def _materials(mesh: Path, library: Path) -> dict[str, _Material]:
                 if not rest.strip():
                     raise ValueError('it has no name')
                 own = found[rest.strip()] = _Material(np.ones(3))
-            elif word in ('kd', 'map_kd') and own is None:
+            elif word not in ('kd', 'map_kd'):
+                continue
+            elif own is None:
                 raise ValueError('no newmtl stands before it')
             elif word == 'kd':
                 own.colour = _colour(rest)
-            elif word == 'map_kd':
+            else:
                 _texture(mesh, library, rest.strip(), own, f'{library}, line {number}: ')
         except ValueError as error:
             raise _broken(library, number, line, error) from error

@@ -49,7 +49,7 @@ class Recovered:
             stretch += f', {loss.chunks} chunk' + 's' * (loss.chunks > 1)
         if loss.messages:
             stretch += f', {loss.messages} message' + 's' * (loss.messages > 1)
-        if loss.size and None not in (loss.before, loss.after):
+        if loss.size and loss.before is not None and loss.after is not None:
             stretch += ', {:.2f} to {:.2f} s from the start'.format(
                 *((time - self.span[0]) * 1e-9 for time in (loss.before, loss.after)))
         kind = 'note' if loss.harmless else 'lost'

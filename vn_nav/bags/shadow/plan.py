@@ -53,6 +53,12 @@ class Event(NamedTuple):
     picture: bool
     decision: Decision | None
 
+    @property
+    def picture_data(self) -> bytes:
+        """Of a picture: its message."""
+        assert self.data is not None  # only ticks may have none
+        return self.data
+
 
 @dataclasses.dataclass
 class Plan:

@@ -105,13 +105,14 @@ def _inflate(stored: memoryview, compression: str, size: int) -> bytes:
         with zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True) as whole:
             return whole.read(size + 1)
     if compression == 'lz4':
-        parts = []
+        parts: list[bytes] = []
         while size > 0 or not parts:
             decompressor = lz4.frame.LZ4FrameDecompressor()
             parts.append(decompressor.decompress(stored, max_length=size + 1))
             if not decompressor.eof:
                 raise ValueError('the frame is not complete')
-            size, stored = size - len(parts[-1]), decompressor.unused_data or b''
+            size -= len(parts[-1])
+            stored = memoryview(decompressor.unused_data or b'')
         return b''.join(parts)
     raise ValueError('the compression is zstd, lz4 or none')
 

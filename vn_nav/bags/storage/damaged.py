@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -80,6 +80,7 @@ class DamagedFile:
     def messages(self) -> Iterator[Message]:
         """The messages that are asked for; ends, and never raises `Damage`."""
         at, trusted = len(MAGIC), True
+        end: int | None
         while at < self._limit:
             opcode = 0
             try:
@@ -116,7 +117,7 @@ class DamagedFile:
         return opcode, length
 
     def _record(self, at: int, opcode: int, length: int, trusted: bool
-                ) -> Iterator[Message]:
+                ) -> Generator[Message, None, int]:
         """The messages of a record; returns where it ends."""
         if opcode == CHUNK:
             self._chunked |= self._is_chunk(at)
@@ -174,7 +175,7 @@ class DamagedFile:
             yield Message(connection, sequence, log_time, publish_time,
                           record[MESSAGE_FIELDS.size:])
 
-    def _chunk(self, at: int, length: int, trusted: bool) -> Iterator[Message]:
+    def _chunk(self, at: int, length: int, trusted: bool) -> Generator[Message, None, int]:
         """The messages of a chunk; returns where it ends."""
         data, head, end = self._unpacked(at, length)
         sure = bool(head.crc)
@@ -251,8 +252,10 @@ class DamagedFile:
         A file without chunks has its messages and declarations searched as well.
         """
         known = self._next_chunk(at)
-        if self._patience <= 0 or known is not None and known < self._limit:
-            return self._limit if self._patience <= 0 else known
+        if self._patience <= 0:
+            return self._limit
+        if known is not None and known < self._limit:
+            return known
         patterns = (_CHUNK_START, MESSAGE_START, DECLARATION_START)[:1 if self._chunked else 3]
         while at < self._limit and self._patience > 0:
             data = self._peek(at, WINDOW)

@@ -277,6 +277,6 @@ def _is_private(opcode: int, kind: int) -> bool:
     return kind != CHUNK and (kind not in (SCHEMA, CHANNEL) or (opcode ^ kind).bit_count() > 1)
 
 
-def may_name(text: bytes, size: int, *, empty: bool) -> bool:
+def may_name(text: bytes | bytearray, size: int, *, empty: bool) -> bool:
     """Whether bytes may be the beginning of a name of a size."""
     return (empty or size > 0) and size <= MAX_NAME and not any(byte < 32 for byte in text)

@@ -79,7 +79,7 @@ def _records(peek: Callable[[int, int], bytes], evidence: Evidence, at: int, siz
         opcode, length = HEAD.unpack(head)
         if evidence.kind(at, opcode, length) != MESSAGE_INDEX:
             break
-        entries = []
+        entries: list[tuple[int, int]] = []
         try:
             end = evidence.delimited_end(at, MESSAGE_INDEX, length)
             if end - at > size + LOOK:
@@ -89,7 +89,8 @@ def _records(peek: Callable[[int, int], bytes], evidence: Evidence, at: int, siz
             pairs = Fields(fields.data())
             found.append((channel, entries))
             while pairs.left:
-                entries.append(pairs.numbers('<QQ'))
+                time, place = pairs.numbers('<QQ')
+                entries.append((time, place))
                 left -= 1
         except Damage as damage:
             if damage.end is None:

@@ -17,7 +17,7 @@ import tempfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -50,7 +50,7 @@ class _Part(NamedTuple):
     crc: int = 0  # of the file up to there
     span: tuple[int, int] | None = None  # least and greatest stamp up to there
     declared: tuple[Schema | Channel, ...] = ()
-    index: bytes = b''  # its record in the summary
+    index: bytes = b''  # type: ignore[assignment]  # its record in the summary
     counts: tuple[tuple[int, int], ...] = ()  # channel, messages
 
 
@@ -62,7 +62,8 @@ class _Parts:
     """
 
     def __init__(self, folder: Path):
-        self._folder, self._file = folder, None
+        self._folder = folder
+        self._file: IO[bytes] | None = None
         self._last: list[_Part] = [_Part()]
         self._blocks: list[tuple[int, int]] = []  # place and size of each `KEPT` before these
 
@@ -102,6 +103,7 @@ class _Parts:
             self._file.close()
 
     def _block(self, place: int, size: int) -> list[_Part]:
+        assert self._file is not None  # where blocks are
         data = os.pread(self._file.fileno(), size, place)
         return [_Part(*values) for values in pickle.loads(zlib.decompress(data))]
 

@@ -238,8 +238,9 @@ class Declared:
 
     def _settle(self, number: int) -> None:
         schema, topic, encoding, metadata = self._declared[number]
-        name, *definition = self._schemas.get(schema, ('', '', b''))
-        connection = Connection(self._path, topic, name, encoding, *definition, metadata)
+        name, schema_encoding, definition = self._schemas.get(schema, ('', '', b''))
+        connection = Connection(self._path, topic, name, encoding, schema_encoding, definition,
+                                metadata)
         self.channels[number] = connection
         self.chosen.setdefault(number, connection)
 

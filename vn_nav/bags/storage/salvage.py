@@ -203,7 +203,8 @@ def _mended(kind: int, body: bytes) -> bytes | None:
 
 def _lengths(kind: int, body: bytes | bytearray) -> tuple[list[int], bool]:
     """The places of lengths in a schema or channel as far as they lead; whether they fit."""
-    at, places = DELIMITED[kind][0], []
+    at = DELIMITED[kind][0]
+    places: list[int] = []
     for number in range(3):
         size = int.from_bytes(body[at:at + 4], 'little')
         start, at = at + 4, at + 4 + size

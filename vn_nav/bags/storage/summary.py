@@ -104,7 +104,9 @@ class Chunks:
 
     def ahead(self, at: int) -> int | None:
         """The earliest time [ns] in the chunk at a place and in those behind it; None: unknown."""
-        return self._ahead[bisect.bisect_left(self._offsets, at)] if at in self else None
+        if self._ahead is None or at not in self:
+            return None
+        return self._ahead[bisect.bisect_left(self._offsets, at)]
 
     def held(self, at: int) -> frozenset[int]:
         """The channels of the messages in the chunk at a place; empty: unknown."""
