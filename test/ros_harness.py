@@ -13,7 +13,7 @@ import torch
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS
-from vn_sim_bridge.floor.contacts import WORLD_VERSION
+from vn_sim_bridge.simulators.house import WORLD_VERSION
 
 
 def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=None):

@@ -39,12 +39,11 @@ from vn_nav.learning.teaching import OWN
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
-from vn_sim_bridge.floor.contacts import WORLD_VERSION
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.recorded.image_graph import build_graph
 from vn_sim_bridge.robot.joystick import Joystick
 from vn_sim_bridge.robot.simulated_robot import TICK
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulators.house import WORLD_VERSION, HouseSimulator
 from vn_sim_bridge.teach_place import draw_map, held_out, make_env, make_pairs
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
@@ -55,16 +54,16 @@ EVERY = 4  # ticks between two pictures
 def drive(seconds, rooms=1, house=7, size=SIZE):
     """Poses [N,3] and pictures of somebody with a joystick in a small house."""
     built = generate_house(house, rooms=rooms)
-    backend = HouseBackend([built], [0], robot=ROBOT, size=size)
+    simulator = HouseSimulator([built], [0], robot=ROBOT, size=size)
     cells = built.floor.centres()
     start = cells[np.argmin(np.hypot(*(cells - built.goals[0].pose[:2]).T))]
-    backend.place(np.array([0]), np.array([[*start, 0.0, 0.0]]))
+    simulator.place(np.array([0]), np.array([[*start, 0.0, 0.0]]))
     person, poses, pictures = Joystick(built, *start), [], []
     for tick in range(int(seconds / TICK)):
-        backend.move(person.velocity(backend.poses[0])[None] * TICK)
+        simulator.move(person.velocity(simulator.poses[0])[None] * TICK)
         if tick % EVERY == 0:
-            poses.append(backend.poses[0, :3].copy())
-            pictures.append(backend.observe().rgb[0].copy())
+            poses.append(simulator.poses[0, :3].copy())
+            pictures.append(simulator.observe().rgb[0].copy())
     return np.array(poses), np.array(pictures)
 
 
@@ -103,7 +102,7 @@ def graph(driven):
 
 def test_a_drive_with_a_joystick_is_a_place(graph):
     """Nothing of it is cut off, robots can turn everywhere, and ways lead to all goals."""
-    assert len(graph.goals) >= 12 and graph.geodesic(*graph.goals[0].pose[:2]).maximum > 2
+    assert len(graph.goals) >= 12 and graph.distance_to(graph.goals[0]).maximum > 2
     assert graph.map.component.mean() > 0.99 and graph.world_version == WORLD_VERSION
     env = make_env(graph, ROBOT, 16, max_decisions=60)
     _, info = env.reset(seed=0)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from vn_nav.learning.presets import ENVIRONMENT
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 HERE = Path(__file__).parent
 # Number in thesis-facts.md, section 6; the trap; the tests (of this file: without a file's name).
@@ -63,7 +64,8 @@ TRAPS = {
 
 
 def make(**options):
-    return NavigationEnv(EnvConfig(**{'houses': (7,), 'num_envs': 8, 'size': 36} | options))
+    return NavigationEnv(EnvConfig(**{
+        'scenes': ('house:7',), 'num_envs': 8, 'size': 36} | options))
 
 
 def test_every_trap_has_its_tests():
@@ -71,7 +73,7 @@ def test_every_trap_has_its_tests():
     for number, (_, names) in TRAPS.items():
         for name in names:
             file, _, function = name.rpartition('::')
-            tree = ast.parse((HERE / (file or Path(__file__).name)).read_text())
+            tree = ast.parse(next(HERE.rglob(file or Path(__file__).name)).read_text())
             assert function in {node.name for node in tree.body
                                 if isinstance(node, ast.FunctionDef)}, (number, name)
 
@@ -164,7 +166,7 @@ def test_trap_11_labels_are_never_resized():
     assert 'vn_nav/observation.py' in found and found <= MAY_RESIZE
     env = make(privileged=('segmentation', 'goal_segmentation'))
     _, info = env.reset(seed=0)
-    classes = set(np.unique(env.backend.observe().labels))
+    classes = set(np.unique(env.simulator.observe().labels))
     assert info['segmentation'].shape == info['goal_segmentation'].shape == (8, 36, 36)
     assert set(np.unique(info['segmentation'])) <= classes
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import math
 import shlex
@@ -12,8 +13,10 @@ from pathlib import Path
 
 from vn_nav import __version__
 from vn_nav.bags.command import add_bag_commands
-from vn_nav.cli_world import add_world, check_backend, load_for_house, machine, make_env
+from vn_nav.cli_scenes import run_simulators, training_scenes
+from vn_nav.cli_world import add_world, check_backend, load_for_scenes, machine, make_env
 from vn_nav.errors import UserError
+from vn_nav.scenes import ROOMS
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -99,6 +102,9 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
     add_bag_commands(commands.add_parser('bag', help='check and repair recorded drives'))
 
+    listed = commands.add_parser('simulators', help='list the simulators, and what each can do')
+    listed.set_defaults(run=run_simulators)
+
     house = commands.add_parser('house', help='look at an embedded house')
     actions = house.add_subparsers(dest='action', required=True, metavar='ACTION')
     for name, words, run, out in (
@@ -124,22 +130,17 @@ def run_collect(args) -> int:
     from vn_nav.bags.recorder import BagWriter
     from vn_nav.robot import RobotSpec, load_robot
     from vn_sim_bridge.datasets.collect import collect, house_scenes
-    from vn_sim_bridge.houses.splits import SPLITS
     from vn_sim_bridge.render.randomisation import load_randomisation
-    if args.house and args.houses:
-        raise UserError('pictures are of named houses or of the first N', '--house and --houses',
-                        'give one of them')
-    count = 1 if args.houses is None else max(args.houses, 0)
-    houses = args.house or list(SPLITS['train'][:count])
+    names = training_scenes(args)
     robot = load_robot(args.robot) if args.robot else RobotSpec()
-    scenes = house_scenes(houses, args.rooms, args.size, robot,
-                          load_randomisation(args.randomisation), args.seed, args.threads)
+    scenes = house_scenes(names, args.size, robot, load_randomisation(args.randomisation),
+                          args.seed, args.threads)
     begun = time.monotonic()
-    done = collect(scenes, len(houses), args.pictures, robot,
+    done = collect(scenes, len(names), args.pictures, robot,
                    lambda topics: BagWriter(args.out, topics))
     seconds = time.monotonic() - begun
     print(f'{args.out}: {done.pictures:,} pictures in {done.episodes:,} episodes of {done.scenes} '
-          f'house{"s" * (done.scenes > 1)}, {done.pictures / seconds:,.0f} pictures/s')
+          f'scene{"s" * (done.scenes > 1)}, {done.pictures / seconds:,.0f} pictures/s')
     return 0
 
 
@@ -151,11 +152,10 @@ def run_train(args) -> int:
     if args.env == 'ros':
         return _train_over_ros(args)
     from vn_nav.learning.trainer import train
-    from vn_sim_bridge.houses.splits import SPLITS
-    from vn_sim_bridge.navigation.env import PRIVILEGED
-    houses = args.house or list(SPLITS['train'][:args.houses or 1])
+    from vn_sim_bridge.navigation.env_config import PRIVILEGED
+    scenes = training_scenes(args)
     config, world = train_config(args), world_options(args)
-    env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
+    env = make_env(scenes, world.pop('envs'), robot=args.robot, threads=config.threads,
                    randomisation=args.randomisation, size=args.size, seed=args.seed,
                    device=config.device,
                    actions=tuple(args.actions.split(',')), task=args.task,
@@ -164,14 +164,15 @@ def run_train(args) -> int:
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
     bags = _bag_mix(args, config, env.robot)
     info = _train_info(args, config, env, bags) | {
-        'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
+        'simulator': env.simulator_name, 'scenes': scenes, 'randomisation': args.randomisation,
         'goals_per_room': args.goals_per_room, 'goal_variants': args.goal_variants,
         'task': args.task, 'objects': args.objects}
     pairs = None
     if config.pair_minutes and not args.init:
         pairs = _pair_sources(args, config)
-    print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
-                pairs=pairs, bags=bags))
+    with contextlib.closing(env):
+        print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
+                    pairs=pairs, bags=bags))
     return 0
 
 
@@ -235,8 +236,7 @@ def _train_over_ros(args) -> int:
             print(line, flush=True)
         env.listen(config.privileged)
         info = _train_info(args, config, env, bags) | {
-            'houses': [env.scene['house']] if 'house' in env.scene else [],
-            'rooms': env.scene.get('rooms')}
+            'simulator': env.simulator_name, 'scenes': env.scene_names}
 
         def say(row: dict) -> None:
             print(f'{row["frames"]:,} frames: {env.steps / env.seconds:.2f} steps/s over ROS, '
@@ -253,7 +253,7 @@ def _pair_sources(args, config):
         from vn_sim_bridge.datasets.house_pairs import PairSampler
         from vn_sim_bridge.houses.splits import SPLITS
         from vn_sim_bridge.render.randomisation import load_randomisation
-        options = {'rooms': args.rooms, 'size': args.size, 'threads': config.threads,
+        options = {'rooms': args.rooms or ROOMS, 'size': args.size, 'threads': config.threads,
                    'robot': load_robot(args.robot) if args.robot else None,
                    'randomisation': load_randomisation(args.randomisation)}
         return (PairSampler(SPLITS['train'][:config.pair_houses], seed=args.seed, **options),
@@ -288,7 +288,7 @@ def run_demo(args) -> int:
     from vn_nav.demo import run
     from vn_nav.resources import share_file
     folder = args.checkpoint or share_file('models/house')
-    task = load_for_house(folder)[0].info['task']  # refuse before anything is written
+    task = load_for_scenes(folder)[0].info['task']  # refuse before anything is written
     if task != 'image':
         raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
                         task, 'use vn_nav evaluate')

@@ -8,53 +8,59 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from vn_nav.cli_scenes import scenes_from, split_scenes
 from vn_nav.cli_world import (
     check_backend,
-    check_world,
+    check_version,
     load_for,
-    load_for_house,
+    load_for_scenes,
     machine,
     make_env,
 )
 from vn_nav.errors import UserError
 from vn_nav.evaluation.command import (
     DRIVE_SPLITS,
-    SPLIT_HOUSES,
+    SPLIT_SCENES,
     check_evaluate_options,
     evaluate,
 )
+from vn_nav.scenes import BAG, HOUSE, house_scene, one_simulator, parse_scene, rooms_of
 
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that `vn_nav publish` tries
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
-def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, controls: bool = True,
+def measure(checkpoint, scenes, *, episodes: int, seed: int, controls: bool = True,
             decoding: str | None = None, threshold: float | None = None, max_decisions: int = 300,
             robot: Path | None = None, randomisation: str | None = None, goal_seed: int = 0):
-    """Episodes of a loaded checkpoint in some houses.
+    """Episodes of a loaded checkpoint in some scenes.
 
     Returns:
-        The episodes as `evaluator.measure` returns them, and the houses' floor plans by seed.
+        The episodes as `evaluator.measure` returns them, and the scenes' floor plans by name.
     """
     from vn_nav.evaluation import evaluator
     from vn_nav.robot import load_robot
     info, plans = checkpoint.info, {}
-    own = set(houses) <= set(info['houses'])
+    own = set(scenes) <= set(info['scenes'])
 
-    def make(seeds, environments: int, stop: str):
-        env = make_env(seeds, rooms, environments, robot=robot, size=checkpoint.config.size,
+    def make(names, environments: int, stop: str):
+        env = make_env(names, environments, robot=robot, size=checkpoint.config.size,
                        randomisation=randomisation or info['randomisation'], task=info['task'],
                        objects=info['objects'], actions=checkpoint.config.actions,
                        max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
                        goals_per_room=info['goals_per_room'] if own else 1)
-        plans.update({house.seed: house.floor_plan() for house in env.houses})
+        check_version(info, simulator=env.simulator_name, version=env.world_version)
+        plans.update({place.name: place.plan() for place in env.places})
+        can = env.simulator.capabilities
+        if not (can.geodesic or env.simulator.planner) and evaluator.SHORTEST in wanted:
+            wanted.remove(evaluator.SHORTEST)
         return env
 
-    wanted = evaluator.CONTROLS if controls else ()
+    wanted = list(evaluator.CONTROLS if controls else ())
     if info['task'] == 'collect':  # no goal: none to show wrong, and no shortest path to it
         wanted = [name for name in wanted if name in (evaluator.OTHER, evaluator.RANDOM)]
     rows = evaluator.measure(
-        make, checkpoint.network, houses, known=info['houses'],
+        make, checkpoint.network, scenes, known=info['scenes'],
         decoding=decoding or info['decoding'],
         episodes=episodes, controls=wanted, seed=seed,
         threshold=info.get('stop_threshold') if threshold is None else threshold,
@@ -62,28 +68,34 @@ def measure(checkpoint, houses, rooms: int, *, episodes: int, seed: int, control
     return rows, plans
 
 
-def _splits(args, info: dict) -> dict[str, list[int]]:
-    """The houses of each split that is asked for."""
-    from vn_sim_bridge.houses.splits import SPLITS
-    if args.house:
-        return {'houses': list(dict.fromkeys(args.house))}
+def _splits(args, info: dict) -> dict[str, list[str]]:
+    """The scenes of each split that is asked for."""
+    rooms = args.rooms or (_rooms(info) if info['simulator'] == HOUSE else None)
+    if args.house or args.scene:
+        return {'scenes': scenes_from(args, rooms)}
     found = {}
     for name in args.split or ['seen_goals']:
         if name in ('seen_goals', 'unseen_goals'):
-            found[name] = info['houses'][:args.houses]
+            found[name] = info['scenes'][:args.houses]
+            if args.rooms:
+                found[name] = list(dict.fromkeys(
+                    house_scene(int(parse_scene(scene).place), rooms) for scene in found[name]))
             if not found[name]:
-                raise UserError('seen and unseen goals are in the houses of the checkpoint',
-                                'a checkpoint that names none', 'give --house or another --split')
-        elif name in SPLITS:
-            found[name] = list(SPLITS[name][:args.houses or SPLIT_HOUSES])
-            known = sorted(set(found[name]) & set(info['houses']))
-            if name != 'train' and known:
-                raise UserError(f'the checkpoint was not trained in houses of split {name}',
-                                f'house {known[0]}', 'choose another split')
+                raise UserError('seen and unseen goals are in the scenes of the checkpoint',
+                                'a checkpoint that names none', 'give --scene, --house or another '
+                                '--split')
         else:
-            raise UserError(f'a split is one of {", ".join(SPLITS)}, seen_goals, unseen_goals',
-                            name, 'choose one of them')
+            found[name] = split_scenes(info['simulator'], name, args.houses or SPLIT_SCENES, rooms)
+            known = [scene for scene in found[name] if scene in info['scenes']]
+            if name != 'train' and known:
+                raise UserError(f'the checkpoint was not trained in scenes of split {name}',
+                                known[0], 'choose another split')
     return found
+
+
+def _rooms(info: dict) -> int | None:
+    """Rooms of the houses that a checkpoint knows."""
+    return rooms_of(info['scenes'][0]) if info['scenes'] else None
 
 
 def run_evaluate(args: argparse.Namespace) -> int:
@@ -94,29 +106,26 @@ def run_evaluate(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as decoded:  # the pictures of a drive are mapped from there
         splits, measure_split = (
             _drive(args, checkpoint, robot, args.cache or Path(decoded)) if args.bag else
-            _houses(args, checkpoint))
+            _scenes(args, checkpoint))
         evaluate(args, checkpoint.info, splits, measure_split)
     return 0
 
 
-def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
-    """The houses of each split, and what measures in them."""
-    from vn_sim_bridge.floor.contacts import WORLD_VERSION
-    check_world(checkpoint.info, WORLD_VERSION)
-    rooms = args.rooms or checkpoint.info['rooms']
-    if rooms is None:
-        raise UserError('houses have a number of rooms', 'a checkpoint that names none',
-                        'give --rooms')
+def _scenes(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
+    """The scenes of each split, and what measures in them."""
+    splits = _splits(args, checkpoint.info)
+    for scenes in splits.values():
+        check_version(checkpoint.info, simulator=one_simulator(scenes)[0])
 
-    def measure_split(name: str, houses):
+    def measure_split(name: str, scenes):
         return measure(
-            checkpoint, houses, rooms, episodes=args.episodes,
+            checkpoint, scenes, episodes=args.episodes,
             seed=args.seed, controls=not args.no_controls, decoding=args.decoding,
             threshold=args.stop_threshold, max_decisions=args.max_decisions, robot=args.robot,
             randomisation=args.randomisation,
             goal_seed=UNSEEN_GOALS if name == 'unseen_goals' else 0)
 
-    return _splits(args, checkpoint.info), measure_split
+    return splits, measure_split
 
 
 def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[dict, Callable]:
@@ -126,7 +135,7 @@ def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[di
     from vn_sim_bridge import teach_place as place
     info = checkpoint.info
     graph = read_place(args, place.build_graph, robot, checkpoint.config.size, cache)
-    check_world(info, graph.world_version)
+    check_version(info, simulator=BAG, version=graph.world_version)
     graphs = {'all_goals': graph}
     if args.split:
         own, others = place.held_out(graph)
@@ -141,33 +150,37 @@ def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[di
             return place.make_env(graphs[name], robot, environments, stop=stop, light=True,
                                   task=info['task'], max_decisions=args.max_decisions)
         rows = evaluator.measure(
-            make, checkpoint.network, [graph.seed], known=info['houses'],
+            make, checkpoint.network, [graph.name], known=info['scenes'],
             decoding=args.decoding or info['decoding'], episodes=args.episodes,
             controls=() if args.no_controls else evaluator.CONTROLS, seed=args.seed,
             threshold=(info.get('stop_threshold') if args.stop_threshold is None
                        else args.stop_threshold), robot=robot)
-        return rows, {graph.seed: graph.floor_plan()}
+        return rows, {graph.name: graph.plan()}
 
-    return {name: [graph.seed] for name in graphs}, measure_split
+    return {name: [graph.name] for name in graphs}, measure_split
 
 
 def run_publish(args) -> int:
     """`vn_nav publish`."""
     from vn_nav.evaluation import evaluator, tables
     from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
-    checkpoint, _ = load_for_house(args.source, args.robot)
+    checkpoint, _ = load_for_scenes(args.source, args.robot)
     info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
     save_checkpoint(args.target, checkpoint.network, info, half=True)
     shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
-    houses, rooms = info['houses'], info['rooms']
+    scenes = info['scenes']
+    if info['simulator'] != HOUSE or not scenes:
+        raise UserError('a policy of embedded houses is published', f'{info["simulator"]} '
+                        f'{", ".join(scenes)}', 'publish one that was trained in houses')
+    rooms = rooms_of(scenes[0])
     if 'arrival' in shipped.config.heads:
         info['stop_threshold'] = _stop_threshold(shipped, args)
         save_checkpoint(args.target, shipped.network, info, half=True)
         shipped = load_checkpoint(args.target)
     info['results'] = {}
-    for place, seeds in (('trained house', houses), (f'unseen house {args.unseen}',
-                                                     [args.unseen])):
-        rows, _ = measure(shipped, seeds, rooms, episodes=args.episodes, seed=10_000,
+    for place, names in (('trained house', scenes),
+                         (f'unseen house {args.unseen}', [house_scene(args.unseen, rooms)])):
+        rows, _ = measure(shipped, names, episodes=args.episodes, seed=10_000,
                           robot=args.robot)
         results = evaluator.figures(rows)
         tables.print_rows(results, place)
@@ -188,7 +201,7 @@ def _stop_threshold(checkpoint, args) -> float:
     from vn_nav.evaluation import evaluator
     success = {}
     for threshold in STOP_THRESHOLDS:
-        rows, _ = measure(checkpoint, checkpoint.info['houses'][:16], checkpoint.info['rooms'],
+        rows, _ = measure(checkpoint, checkpoint.info['scenes'][:16],
                           episodes=args.episodes, seed=20_000, controls=False,
                           threshold=threshold, robot=args.robot)
         (row,) = evaluator.figures(rows)[evaluator.DECLARED].values()

@@ -109,7 +109,8 @@ def read_place(args: argparse.Namespace, build_graph: Callable, robot: RobotSpec
     return build_graph(
         part.drives.image, poses, _episodes(part), robot, depth=part.drives.depth,
         farthest=MAX_DEPTH, goals=args.goals, goal_pictures=drives.goals, **margin,
-        world_version=str(scene_of(args.bag).get('world_version', RECORDED)))
+        world_version=str(scene_of(args.bag).get('world_version', RECORDED)),
+        name=f'bag:{args.bag}')
 
 
 def _episodes(part: Part) -> np.ndarray:

@@ -15,9 +15,10 @@ from vn_nav.bags.recorded_place import (
 )
 from vn_nav.errors import UserError
 
-OF_HOUSES = ('house', 'houses', 'rooms', 'randomisation')  # options without meaning in a bag
+# Options without meaning in a bag.
+OF_SCENES = ('scene', 'house', 'houses', 'rooms', 'randomisation')
 DRIVE_SPLITS = ('seen_goals', 'unseen_goals')  # as `vn_nav teach` learns goals, and holds them out
-SPLIT_HOUSES = 20  # of a split that the checkpoint does not know, unless told otherwise
+SPLIT_SCENES = 20  # of a split that the checkpoint does not know, unless told otherwise
 
 
 def add_evaluate_options(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +32,7 @@ def add_evaluate_options(parser: argparse.ArgumentParser) -> None:
                         'recorded drive, as `vn_nav teach` makes a place of it, not in houses')
     add_place_options(parser)
     parser.add_argument('--houses', type=int, metavar='N', help='the first N houses of each split '
-                        f'(default: all of its own, {SPLIT_HOUSES} others)')
+                        f'(default: all of its own, {SPLIT_SCENES} others)')
     parser.add_argument('--episodes', type=int, default=100,
                         help='of a row at least; the same number in each house')
     parser.add_argument('--max-decisions', type=int, default=300)
@@ -39,7 +40,7 @@ def add_evaluate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--stop-threshold', type=float, metavar='P', help='probability above '
                         "which the arrival head declares a stop (default: the checkpoint's)")
     parser.add_argument('--no-controls', action='store_true')
-    parser.add_argument('--per-scene', action='store_true', help='print each house as well')
+    parser.add_argument('--per-scene', action='store_true', help='print each scene as well')
     parser.add_argument('--json', type=Path, metavar='FILE', help='also write the figures here')
     parser.add_argument('--html', type=Path, metavar='FILE', help='also write a page with maps')
     parser.add_argument('--maps', type=int, default=6, help='of episodes of each split')
@@ -70,8 +71,9 @@ def check_evaluate_options(args) -> None:
         (args.episodes >= 1, 'there is at least one episode', args.episodes, 'raise --episodes'),
         (args.houses is None or args.houses >= 1, 'a split has at least one house', args.houses,
          'raise --houses'),
-        (not (args.house and (args.split or args.houses)), 'houses are given by seed or by split',
-         '--house together with --split or --houses', 'leave one of them out'),
+        (not ((args.house or args.scene) and (args.split or args.houses)),
+         'scenes are given by name or by split',
+         '--scene or --house together with --split or --houses', 'leave one of them out'),
         (args.stop_threshold is None or 0 <= args.stop_threshold < 1,
          'the stop threshold lies in [0, 1)', args.stop_threshold, 'choose a value in range'),
         (args.maps >= 0, 'the number of maps is not negative', args.maps, 'raise --maps'),
@@ -90,7 +92,7 @@ def check_evaluate_options(args) -> None:
 def _check_drive(args) -> None:
     """Whether the options are for a recorded drive."""
     check_place_options(args)
-    for name in OF_HOUSES:
+    for name in OF_SCENES:
         if getattr(args, name) is not None:
             raise UserError('a recorded drive has pictures and a size of its own',
                             f'--{name} together with --bag', 'leave one of them out')
@@ -107,14 +109,14 @@ def _check_folders(*files: Path | None) -> None:
                             'make the folder, or choose another place')
 
 
-def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) -> None:
+def evaluate(args, info: dict, splits: dict[str, list[str]], measure: Callable) -> None:
     """Measure every split, print its tables, write JSON and page.
 
     Args:
         args: of the command line.
         info: of the checkpoint.
-        splits: seeds of the houses by the split's name.
-        measure: (split, houses) -> episodes as of `evaluator.measure`, floor plans by seed.
+        splits: names of the scenes by the split's name.
+        measure: (split, scenes) -> episodes as of `evaluator.measure`, floor plans by scene.
     """
     from vn_nav.evaluation import evaluator, tables
     from vn_nav.evaluation.evaluation_page import evaluation_page
@@ -122,17 +124,16 @@ def evaluate(args, info: dict, splits: dict[str, list[int]], measure: Callable) 
     result = {
         'checkpoint': str(args.checkpoint), 'sha256': info['sha256'],
         'bag': args.bag.name if args.bag else None,
-        'world_version': info['world_version'], 'task': info['task'],
+        'simulator': info['simulator'], 'world_version': info['world_version'],
+        'task': info['task'],
         'decoding': args.decoding or info['decoding'], 'max_decisions': args.max_decisions,
         'seed': args.seed, 'date': datetime.date.today().isoformat(), 'splits': {}}
     measured, plans = {}, {}
-    for name, houses in splits.items():
-        measured[name], plans[name] = measure(name, houses)
-        scenes = evaluator.by_scene(measured[name])
-        result['splits'][name] = split = {
-            'houses': houses, 'rows': evaluator.figures(measured[name]),
-            'scenes': {str(seed): evaluator.figures(scenes[seed]) for seed in houses}}
-        title = (f'{args.checkpoint}, {tables.place(name, houses, result["bag"])}, '
+    for name, scenes in splits.items():
+        measured[name], plans[name] = measure(name, scenes)
+        split = evaluator.split_figures(measured[name], scenes)
+        result['splits'][name] = split
+        title = (f'{args.checkpoint}, {tables.place(name, scenes, result["bag"])}, '
                  f'{args.max_decisions} decisions at most')
         tables.print_rows(split['rows'], title)
         if args.per_scene and not args.bag:

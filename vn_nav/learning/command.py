@@ -106,7 +106,7 @@ def check_train_options(args: argparse.Namespace) -> None:
         if given:
             raise UserError(rule, ' '.join(given), remedy)
     if args.env == 'ros':
-        refuse(('house', 'houses', 'envs', 'pair_minutes', 'goal_variants'),
+        refuse(('scene', 'house', 'houses', 'envs', 'pair_minutes', 'goal_variants'),
                'where robots drive is not for their trainer to choose',
                'leave these out with --env ros')
     else:
@@ -115,9 +115,6 @@ def check_train_options(args: argparse.Namespace) -> None:
     if not args.bags:
         refuse(('bag_share', 'topics', 'cache'), 'these are for learning from bags',
                'add --bags BAG')
-    if args.house and args.houses:
-        raise UserError('a training is in named houses or in the first N', '--house and --houses',
-                        'give one of them')
 
 
 def config_over_ros(config: TrainConfig, world: dict, offers: Collection[str], lock_step: bool

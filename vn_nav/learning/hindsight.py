@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vn_nav.arrival import arrived, heading_error
+from vn_nav.bags.dataset import MAX_DEPTH
 from vn_nav.bags.drive import MISFIT
 from vn_nav.errors import UserError
-from vn_nav.learning.auxiliary import MAX_DEPTH
 from vn_nav.overlap import lift, overlap, overlap_by_poses, relative_pose
 from vn_nav.robot import RobotSpec
 

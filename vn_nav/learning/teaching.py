@@ -31,6 +31,7 @@ from vn_nav.learning.trainer import CHECKPOINT, STATE, has_fast_bfloat16, train
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.robot import RobotSpec
+from vn_nav.scenes import parse_scene
 
 PRESET = 'fast'
 FOR_A_SPOT = 4  # pictures for each spot that the policy tells apart, at least
@@ -170,6 +171,7 @@ class Teaching:
         known = self.given.info['stop_threshold'] if self.given else None
         threshold = known or evaluator.STOP_THRESHOLD
         facts = {'checkpoint': str(self.folder), 'bag': self.args.bag.name,
+                 'simulator': taught.info['simulator'],
                  'world_version': taught.info['world_version'], 'task': 'image',
                  'max_decisions': DECISIONS}
         graphs = {name: graph for name, graph in self._graphs().items() if graph is not None}
@@ -297,6 +299,7 @@ class Teaching:
         return {
             'camera_fov_deg': math.degrees(self.robot.camera_fov),
             'camera_height': self.robot.camera_height,
+            'simulator': parse_scene(self.graph.name).simulator,
             'world_version': self.graph.world_version, 'preset': PRESET, 'stop_threshold': None,
             'command': 'vn_nav ' + shlex.join(word for word in sys.argv[1:]
                                               if word != '--resume'),

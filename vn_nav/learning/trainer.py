@@ -31,6 +31,7 @@ from vn_nav.learning.state_file import read_state, remove_partial, write_state, 
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.resnet import load_frozen_weights
+from vn_nav.vector_env import NavigationVectorEnv
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
@@ -41,8 +42,8 @@ COLUMNS = ('frames', 'minutes', 'fps', 'tau', 'success', 'return', 'length', 'co
 RECENT = 200  # episodes that the shown success, return, length and collisions are means over
 
 
-def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False, info: dict,
-          init: str | Path | None = None,
+def train(env: NavigationVectorEnv, config: TrainConfig, folder: str | Path, *,
+          resume: bool = False, info: dict, init: str | Path | None = None,
           pairs: Callable[[], tuple[PairSource, PairSource]] | None = None,
           bags: BagMix | None = None, on_update: Callable[[dict], None] | None = None) -> Path:
     """Train a policy; SIGINT and SIGTERM save and end it early, cleanly.
@@ -50,9 +51,9 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
     The folder gets `checkpoint/`, `training_state`, `metrics.csv` and, if asked for,
     `tensorboard/` and `replay/`. A killed training loses what came after the last save, at most
     `config.checkpoint_seconds`. Resumed, it repeats the uninterrupted one bit for bit (one
-    thread, no wall-clock limit) if the environment has `get_state() -> dict of arrays` and
-    `set_state(dict)`, otherwise its episodes begin anew; of a replay memory it lacks the steps
-    that the killed one had overwritten. It says what it found.
+    thread, no wall-clock limit) if the environment is `restorable`, otherwise its episodes begin
+    anew; of a replay memory it lacks the steps that the killed one had overwritten. It says what
+    it found.
 
     Started by torchrun, several processes train one policy (`vn_nav.learning.distributed`):
     frames are those of all, the first one writes the files, and a process that died is replaced
@@ -399,7 +400,7 @@ class Training:
 
     def _state_dict(self) -> dict:
         env = None  # of many processes each has its own, which nobody saves
-        if hasattr(self.env, 'get_state') and self.processes.count == 1:
+        if self.env.restorable and self.processes.count == 1:
             env = {name: torch.from_numpy(np.array(rows))
                    for name, rows in self.env.get_state().items()}
         return {

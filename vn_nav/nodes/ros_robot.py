@@ -32,6 +32,7 @@ from std_msgs.msg import Bool, Float32, Int8, String, UInt8
 from std_srvs.srv import Trigger
 
 from vn_msgs_py import images
+from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.topics import VOLATILE, topic
 from vn_nav.bags.recorder import BagWriter, RecordingStopped
 from vn_nav.bags.stamped import WINDOW
@@ -323,7 +324,7 @@ class RosRobot(Node):
     def _on_camera_info(self, message: CameraInfo) -> None:
         side, focal = min(message.width, message.height), message.k[0]
         if side > 0 and math.isfinite(focal) and focal > 0:
-            self.camera_fov = 2 * math.atan(side / 2 / focal)
+            self.camera_fov = field_of_view(side, side, focal)
 
     def _on_stop(self, _request, response):
         with self.wake:

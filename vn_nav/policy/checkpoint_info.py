@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vn_nav.errors import UserError
+from vn_nav.scenes import HOUSE, house_scene
 from vn_nav.structured_file import read_json
 
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
@@ -20,12 +21,12 @@ DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
 # What a checkpoint says beside its weights, and what it says when nobody told it.
 INFO = {
-    'world_version': REQUIRED,  # of the simulator's pixels, houses and motion
+    'world_version': REQUIRED,  # of the simulator's pixels, places and motion
     'camera_fov_deg': REQUIRED,  # of the square picture
     'camera_height': REQUIRED,  # m above the floor
     'decoding': 'sample',  # the rule that `results` were measured with
-    'houses': [],  # seeds
-    'rooms': None,  # of each house
+    'simulator': HOUSE,  # that it was trained in, see `vn_sim_bridge.simulators`
+    'scenes': [],  # names, see `vn_nav.scenes`
     'task': 'image',  # what it was trained for
     'objects': 1,  # in the house at a time
     'randomisation': 'none',  # of light, camera and base: a name, or a file's path
@@ -47,8 +48,8 @@ INFO = {
 INFO_TYPES = {
     'world_version': (str,), 'decoding': (str,), 'task': (str,), 'randomisation': (str,),
     'preset': (str,), 'command': (str,), 'notes': (str,), 'results': (dict,),
-    'data': (str,), 'losses': (list, tuple), 'houses': (list, tuple),
-    'rooms': (int, 1, 1000), 'objects': (int, 0, 1000),
+    'data': (str,), 'losses': (list, tuple), 'scenes': (list, tuple),
+    'simulator': (str,), 'objects': (int, 0, 1000),
     'goals_per_room': (int, 1, 1000), 'goal_variants': (int, 1, 1000),
     'stop_threshold': (NUMBER, 0, 1), 'seed': (int, -2**63, 2**64), 'frames': (int, 0, 2**63),
     'minutes': (NUMBER, 0, 1e9), 'camera_fov_deg': (NUMBER, 1e-3, 179),
@@ -104,6 +105,7 @@ def check_info(info: dict, where: str) -> dict:
     Raises:
         UserError: a missing or unknown key, or a value of a wrong type or size.
     """
+    info = _named_scenes(info, where)
     unknown = sorted(info.keys() - INFO.keys())
     if unknown:
         raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} beside the network',
@@ -121,15 +123,26 @@ def check_info(info: dict, where: str) -> dict:
     return full
 
 
+def _named_scenes(info: dict, where: str) -> dict:
+    """The same, with names in place of the seeds of houses that earlier versions wrote."""
+    if 'houses' not in info:
+        return {key: value for key, value in info.items() if key != 'rooms'}
+    houses, rooms = info['houses'], info.get('rooms')
+    numbers = [*houses, rooms or 1] if isinstance(houses, (list, tuple)) else [None]
+    if not all(type(number) is int and 0 <= number < 2**63 for number in numbers):
+        raise UserError('houses is a list of seeds, and rooms their number', reprlib.repr(
+            (houses, rooms)), f'correct {where}')
+    return {**{key: value for key, value in info.items() if key not in ('houses', 'rooms')},
+            'scenes': [house_scene(seed, rooms) for seed in houses]}
+
+
 def _check_entry(key: str, value: object, where: str) -> None:
     """Raise a `UserError` for a value of another type than its key's, or out of its range."""
     rule = INFO_TYPES[key]
     kinds, span = (rule[0], rule[1:]) if len(rule) == 3 else (rule, ())
     kinds = kinds if isinstance(kinds, tuple) else (kinds,)
     kept = isinstance(value, kinds) and not isinstance(value, bool)
-    if kept and key == 'houses':
-        kept = all(isinstance(house, int) and not isinstance(house, bool) for house in value)
-    if kept and key == 'losses':
+    if kept and key in ('losses', 'scenes'):
         kept = all(isinstance(name, str) for name in value)
     if not kept:
         names = ' or '.join(kind.__name__ for kind in kinds)
