@@ -199,9 +199,18 @@ def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, ca
     assert own != others
 
 
+@pytest.mark.slow
+def test_a_drive_is_a_scene_by_its_name(bag, tmp_path):
+    model, figures = write_checkpoint(tmp_path / 'model', size=SIZE), tmp_path / 'figures.json'
+    assert main(['evaluate', str(model), '--scene', f'bag:{bag}', '--episodes', '4',
+                 '--max-decisions', '5', '--no-controls', '--json', str(figures)]) == 0
+    assert list(json.loads(figures.read_text())['splits']['scenes']['scenes']) == [f'bag:{bag}']
+    assert main(['evaluate', str(model), '--scene', 'bag:/nowhere', '--episodes', '4']) == 2
+
+
 @pytest.mark.parametrize(('known', 'code', 'says'), [
     ({'world_version': '0'}, 2, 'world version'), ({'world_version': 'recorded'}, 0, ''),
-    ({'task': 'room'}, 2, 'its task is image'), ({'camera_fov_deg': 60.0}, 2, 'the camera')])
+    ({'task': 'room'}, 2, 'knows rooms'), ({'camera_fov_deg': 60.0}, 2, 'the camera')])
 def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, bag, tmp_path,
                                                            capsys):
     model = write_checkpoint(tmp_path / 'model', size=SIZE)

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from vn_sim_bridge.render.randomisation import Randomisation
 
 
-
 class Goal(NamedTuple):
     """Where a goal picture is taken."""
 

@@ -57,7 +57,7 @@ def make_env(graph: ImageGraph, robot: RobotSpec, envs: int, *, privileged: tupl
         privileged=tuple(sorted(set(privileged) & set(PRIVILEGED))), **options)
     return NavigationEnv(config, robot,
                          simulator=RecordedSimulator(graph, envs, robot=robot, draw=draw,
-                                                   light=light))
+                                                     light=light))
 
 
 def make_pairs(own: ImageGraph, others: ImageGraph | None, robot: RobotSpec, seed: int

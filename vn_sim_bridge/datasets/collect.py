@@ -84,7 +84,7 @@ class HouseScene:
         self._draws = draws
         house, = self._sampler.houses
         self.simulator = HouseSimulator([house], np.zeros(GROUPS * VIEWS, np.int64), robot=robot,
-                                    size=size, threads=threads, randomisation=randomisation)
+                                        size=size, threads=threads, randomisation=randomisation)
         self.facts = {
             'simulator': HOUSE, 'world_version': self.simulator.version,
             'rooms': len(house.rooms),

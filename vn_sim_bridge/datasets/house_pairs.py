@@ -59,7 +59,7 @@ class PairSampler:
         self.count = 0  # pairs drawn so far
         self._seed, self._size = seed, size
         self._simulator = HouseSimulator(self.houses, [0], robot=robot or RobotSpec(), size=size,
-                                     threads=threads, randomisation=randomisation)
+                                         threads=threads, randomisation=randomisation)
         cells = [house.floor.centres() for house in self.houses]
         maps = [house.floor.free for house in self.houses]
         free = np.zeros((len(maps), *np.max([part.shape for part in maps], axis=0)), bool)
@@ -182,7 +182,7 @@ class PairSampler:
         """Pictures from poses, and the cameras that took them; `view` tells the two apart."""
         appearance = self._simulator.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
         frames = self._simulator.view(house, poses, None, appearance,
-                                    key(self._seed, Stream.PAIR_SENSOR, numbers, view))
+                                      key(self._seed, Stream.PAIR_SENSOR, numbers, view))
         return frames, self._simulator.cameras(poses, appearance)
 
 

@@ -176,7 +176,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             view, variant = np.divmod(np.arange(part.start, part.stop), self._variants)
             poses = self.goal_poses[view]
             appearance = self.simulator.appearance(self.config.seed, Stream.GOAL_APPEARANCE, view,
-                                                 variant)
+                                                   variant)
             frames = self.simulator.view(
                 np.array([views[k].place for k in view]), poses, None, appearance,
                 key(self.config.seed, Stream.GOAL_APPEARANCE, view, variant, 99),
@@ -289,7 +289,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         for name, part in self.task.state.items():
             part[:] = state[f'task_{name}']
         self.simulator.apply_appearance(everyone, self._seeds, Stream.APPEARANCE, self._numbers,
-                           self._episode)
+                                        self._episode)
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None,
               options: dict | None = None):
@@ -472,7 +472,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     def _look(self) -> Frames:
         return self.simulator.observe(keys=key(self._seeds, Stream.SENSOR, self._numbers,
-                                             self._episode, self._step))
+                                               self._episode, self._step))
 
     def _result(self, frames: Frames, reset, success, collided):
         image = frames.rgb.copy()
@@ -512,7 +512,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             info['oracle_action'] = self.oracle_actions()
         if 'oracle_regret' in self.config.privileged:
             info['oracle_regret'] = self.simulator.planner.regrets(self.simulator.poses,
-                                                                self.goal_poses[self._goal])
+                                                                   self.goal_poses[self._goal])
         if 'goal_pose' in self.config.privileged:
             info['goal_pose'] = self._goal_pose()
         if {'overlap', 'explorer_action'} & set(self.config.privileged):

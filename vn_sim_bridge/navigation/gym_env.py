@@ -33,7 +33,7 @@ class HouseNavigation(gymnasium.Env):
         if isinstance(options.get('randomisation'), str):
             options['randomisation'] = load_randomisation(options['randomisation'])
         self._batch = NavigationEnv(EnvConfig(scenes=(house_scene(house, rooms),), num_envs=1,
-                                             **options))
+                                              **options))
         size = self._batch.config.size
         picture = spaces.Box(0, 255, (3, size, size), np.uint8)
         self.observation_space = spaces.Dict({'image': picture, 'goal': picture})

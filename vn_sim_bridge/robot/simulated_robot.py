@@ -202,7 +202,7 @@ class SimulatedRobot:
                    draw_variant(variants, self.seed, index, 0))
         counter = (self.seed, Stream.GOAL_APPEARANCE, np.array([goal]), np.array([variant]))
         return self.simulator.view(np.zeros(1, np.int64), np.array([self.goal.pose]), None,
-                                 self.simulator.appearance(*counter), key(*counter, 99))
+                                   self.simulator.appearance(*counter), key(*counter, 99))
 
     def observe(self) -> Frames:
         """The camera's picture; with a late camera at times the one before."""

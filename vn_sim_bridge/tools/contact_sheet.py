@@ -38,7 +38,7 @@ def contact_sheet(house: House, randomisation: Randomisation | None = None, *,
         [H,W,3] uint8 RGB.
     """
     simulator = HouseSimulator([house], [0], robot=RobotSpec(), size=VIEW,
-                           randomisation=randomisation)
+                               randomisation=randomisation)
     rng = np.random.default_rng(seed)
     views = max(0, pictures - len(house.goals))
     centres = house.floor.centres()
@@ -47,7 +47,7 @@ def contact_sheet(house: House, randomisation: Randomisation | None = None, *,
     poses = np.concatenate([[goal.pose for goal in house.goals], random])
     looks = simulator.appearance(seed, Stream.APPEARANCE, np.arange(len(poses)), 0)
     tiles = simulator.view(np.zeros(len(poses), np.int64), poses, None,
-                         looks).rgb.transpose(0, 2, 3, 1)
+                           looks).rgb.transpose(0, 2, 3, 1)
     blank = np.full((-len(tiles) % COLUMNS, VIEW, VIEW, 3), PAPER, np.uint8)
     tiles = np.concatenate([tiles, blank])
     rows = [np.concatenate(list(tiles[k:k + COLUMNS]), axis=1)

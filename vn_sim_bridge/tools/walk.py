@@ -44,7 +44,7 @@ class Walk:
     def __init__(self, house: House, size: int, randomisation: Randomisation | None = None):
         self.house, self.lights, self.touched = house, 0, False
         self.simulator = HouseSimulator([house], [0], robot=RobotSpec(), size=size,
-                                    randomisation=randomisation)
+                                        randomisation=randomisation)
         x, y, yaw, _ = house.goals[0].pose
         self.simulator.place(np.array([0]), np.array([[x, y, yaw, 0.0]]))
 
