@@ -280,3 +280,11 @@ def test_the_table_imports_nothing_before_it_is_asked():
             'print([m for m in sys.modules if m.startswith("vn_sim_bridge.simulators.")])')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip() == '[]', done.stderr
+
+
+def test_every_capability_is_read():
+    sources = [path.read_text() for folder in ('navigation', 'robot', '.')
+               for path in (ROOT / 'vn_sim_bridge' / folder).glob('*.py')]
+    for field in dataclasses.fields(corridor.CorridorSimulator.capabilities):
+        assert any(f'can.{field.name}' in text or f'capabilities.{field.name}' in text
+                   for text in sources), f'nobody reads {field.name}'
