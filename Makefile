@@ -18,7 +18,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 READY_ALL := $(VENV)/.ready-all
 READY_DOCS := $(VENV)/.ready-docs
-SOURCES := setup.py launch test vn_msgs_py vn_nav vn_sim_bridge
+SOURCES := setup.py examples launch test vn_msgs_py vn_nav vn_sim_bridge
 
 # A sourced ROS, or another virtual environment of ROS wheels, shadows ours with its modules,
 # libraries and middleware. ROS_DOMAIN_ID stays: it is the user's choice, not an installation's.

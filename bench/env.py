@@ -11,15 +11,19 @@ import sys
 import numpy as np
 from common import ROUNDS, frames_per_second, pin, report
 
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.render.rasterizer import Rasterizer
 
 ENVS = 64
 MEMORY = f"""
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 import numpy as np
-env = NavigationEnv(EnvConfig(houses=tuple(range(16)), rooms=6, num_envs={ENVS}))
+env = NavigationEnv(EnvConfig(scenes=house_scenes(range(16), 6), num_envs={ENVS}))
 env.reset(seed=0)
 for _ in range(50):
     env.step(np.zeros({ENVS}, np.int64))
@@ -36,32 +40,32 @@ def main():
     arguments = parser.parse_args()
     pin(1)
     rows = {
-        'one house': {'houses': (7,)},
-        '16 houses': {'houses': tuple(range(16))},
-        '16 houses, randomised': {'houses': tuple(range(16)),
+        'one house': {'scenes': ('house:7?rooms=6',)},
+        '16 houses': {'scenes': house_scenes(range(16), 6)},
+        '16 houses, randomised': {'scenes': house_scenes(range(16), 6),
                                   'randomisation': load_randomisation('standard')},
-        'object goal': {'houses': (7,), 'task': 'object', 'objects': 4},
-        'room goal': {'houses': (7,), 'task': 'room'},
-        'collect': {'houses': (7,), 'task': 'collect', 'objects': 10},
+        'object goal': {'scenes': ('house:7?rooms=6',), 'task': 'object', 'objects': 4},
+        'room goal': {'scenes': ('house:7?rooms=6',), 'task': 'room'},
+        'collect': {'scenes': ('house:7?rooms=6',), 'task': 'collect', 'objects': 10},
     }
     rng = np.random.default_rng(0)
     actions = rng.integers(0, 4, (1000, ENVS))
     steppers, renders = {}, {}
     for name, options in rows.items():
-        env = NavigationEnv(EnvConfig(rooms=6, num_envs=ENVS, **options))
+        env = NavigationEnv(EnvConfig(num_envs=ENVS, **options))
         env.reset(seed=0)
         turn = iter(range(1 << 62))
 
         def step(env=env, turn=turn):
             env.step(actions[next(turn) % 1000])
 
-        renderer = Rasterizer([house.scene for house in env.houses], 84)
+        renderer = Rasterizer([house.scene for house in env.places], 84)
         buffers = []
 
         def render(env=env, renderer=renderer, buffers=buffers):
-            cameras = np.column_stack([env.backend.poses[:, :2], np.ones(ENVS),
-                                       env.backend.poses[:, 2:]])
-            out = renderer.render(env.house_index, cameras, np.pi / 2, buffers[0] if buffers
+            cameras = np.column_stack([env.simulator.poses[:, :2], np.ones(ENVS),
+                                       env.simulator.poses[:, 2:]])
+            out = renderer.render(env.place_index, cameras, np.pi / 2, buffers[0] if buffers
                                   else None)
             buffers[:] = [out]
         for _ in range(20):

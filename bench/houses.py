@@ -11,8 +11,8 @@ import time
 import numpy as np
 
 from vn_nav.cli.world import machine
+from vn_sim_bridge.floor.floor_map import main_component
 from vn_sim_bridge.houses import procedural
-from vn_sim_bridge.houses.house import main_component
 from vn_sim_bridge.houses.procedural import MAX_ROOMS, generate_house
 
 

@@ -26,12 +26,13 @@ from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.loop_closure import between, straighten
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.counter_random import Stream, key
-from vn_sim_bridge.houses.house import CELL, House
+from vn_sim_bridge.floor.floor_map import CELL
+from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.odometry import advance, drift_errors
 from vn_sim_bridge.simulator import Frames
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulators.house import HouseSimulator
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 RATE = 8.0  # pictures a second
@@ -152,14 +153,14 @@ def drift(poses: np.ndarray, factor: float, scale: float, seed: int) -> np.ndarr
 def drive(house: House, seconds: float, size: int, randomisation: str, seed: int) -> Drive:
     """A tour, rendered in one light and through one camera."""
     poses, times = tour(house, seconds, seed)
-    backend = HouseBackend([house], [0], robot=ROBOT, size=size,
+    simulator = HouseSimulator([house], [0], robot=ROBOT, size=size,
                            randomisation=load_randomisation(randomisation))
-    drawn = backend.appearance(seed, Stream.APPEARANCE, [0], [0])
+    drawn = simulator.appearance(seed, Stream.APPEARANCE, [0], [0])
     images = np.empty((len(poses), 3, size, size), np.uint8)
     depth = np.empty((len(poses), size, size), np.uint8)
     for first in range(0, len(poses), BATCH):
         part = np.arange(first, min(first + BATCH, len(poses)))
-        seen: Frames = backend.view(
+        seen: Frames = simulator.view(
             np.zeros(len(part), np.int64), np.column_stack([poses[part], 0 * part]), None,
             type(drawn)(*(np.repeat(field, len(part), axis=0) for field in drawn)),
             key(seed, Stream.SENSOR, part, 0))

@@ -17,7 +17,8 @@ from torch import nn
 from torch.distributions import Categorical
 
 from vn_sim_bridge.counter_random import Stream, key
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 ENVS, STEPS = 64, 32  # of a rollout
 EPOCHS, MINIBATCHES = 2, 4
@@ -30,7 +31,7 @@ VALUE, ENTROPY = 0.5, 0.01  # coefficients of the loss
 
 def make_env() -> NavigationEnv:
     """The environment of every loop."""
-    return NavigationEnv(EnvConfig(houses=(7,), rooms=6, num_envs=ENVS, progress_reward=1.0,
+    return NavigationEnv(EnvConfig(scenes=('house:7?rooms=6',), num_envs=ENVS, progress_reward=1.0,
                                    collision_reward=-0.02))
 
 
@@ -57,7 +58,7 @@ class StackedEnv:
             last = {n: {name: rows[n].copy() for name, rows in stacked.items()} for n in ended}
             env._begin(ended)
             env._done[ended] = False
-            frames = env.backend.observe(ended, key(env._seed, Stream.SENSOR, ended,
+            frames = env.simulator.observe(ended, key(env._seed, Stream.SENSOR, ended,
                                                     env._episode[ended], env._step[ended]))
             stacked['picture'][ended, :3] = frames.rgb
             stacked['picture'][ended, 3:] = env.goals[env._shown_goal[ended]]

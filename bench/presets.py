@@ -23,7 +23,8 @@ from common import pin, report
 from vn_nav.learning.distributed import Processes
 from vn_nav.learning.presets import ENVIRONMENT, preset
 from vn_nav.learning.training import Training
-from vn_sim_bridge.navigation.env import PRIVILEGED, EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import PRIVILEGED, EnvConfig
 
 WARM_UP = 4  # updates
 
@@ -34,7 +35,7 @@ def begun(name: str, bf16: bool, overlap: bool, threads: int, folder: Path) -> T
                     pair_minutes=0.0)
     world = dict(ENVIRONMENT[name])
     env = NavigationEnv(EnvConfig(
-        houses=(3,), rooms=2, num_envs=world.pop('envs'),
+        scenes=('house:3?rooms=2',), num_envs=world.pop('envs'),
         privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world),
         threads=config.threads)
     training = Training(env, config, folder, {}, Processes())

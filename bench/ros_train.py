@@ -29,7 +29,9 @@ from vn_nav.learning.presets import ENVIRONMENT, preset
 from vn_nav.learning.training import Training
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 HOUSE, ROOMS = 7, 5
 BASE = share_file('config/robots/demo_base.yaml')
@@ -82,7 +84,8 @@ def main():
             config, _ = config_over_ros(preset(arguments.preset), world, over_ros.offers, True)
             over_ros.listen(config.privileged)
             inside = NavigationEnv(EnvConfig(
-                houses=(HOUSE,), rooms=ROOMS, num_envs=1, privileged=config.privileged), ROBOT)
+                scenes=house_scenes((HOUSE,), ROOMS), num_envs=1,
+                privileged=config.privileged), ROBOT)
             ways = {name: begun(env, config, Path(out) / name)
                     for name, env in (('ros', over_ros), ('inside', inside))}
             rows = {name: [] for name in ways}

@@ -55,14 +55,15 @@ from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.report.tables import print_rows
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
+from vn_nav.scenes import house_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.viewpoints import VIEW, interest
-from vn_sim_bridge.navigation.env import STOPS
+from vn_sim_bridge.navigation.env_config import STOPS
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.goal_pictures import GoalPicture, load_goal_pictures, save_goal_pictures
 from vn_sim_bridge.robot.joystick import Joystick
 from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulators.house import HouseSimulator
 from vn_sim_bridge.tools.contact_sheet import MARGIN, SCALE, house_map
 
 STAGES = ('record', 'teach', 'drive')
@@ -176,7 +177,7 @@ def _write_robot(options) -> None:
 
 def _bridge(options) -> dict:
     """Parameters of the bridge in both drives."""
-    return {'house': options.house, 'rooms': options.rooms, 'size': options.size,
+    return {'scene': house_scene(options.house, options.rooms), 'size': options.size,
             'robot': str(options.out / 'robot.yaml'), 'randomisation': options.randomisation,
             'odometry_drift': options.drift, 'time': 'lock_step'}
 
@@ -335,7 +336,7 @@ def choose_goals(options, shown: Shown) -> list[GoalPicture]:
     """Pictures of the bag, each the most interesting of a few that were drawn at random."""
     rng = np.random.default_rng(DRIVE_SEED)
     house = generate_house(options.house, rooms=options.rooms)
-    backend = HouseBackend([house], [0], robot=load_robot(options.out / 'robot.yaml'), size=VIEW)
+    backend = HouseSimulator([house], [0], robot=load_robot(options.out / 'robot.yaml'), size=VIEW)
     drawn = rng.permutation(len(shown.pictures))[:LOOKED_AT * options.goals]
     if len(drawn) < LOOKED_AT * options.goals:
         raise UserError(f'a bag holds {LOOKED_AT} pictures for every goal',
@@ -414,8 +415,9 @@ def without_ros(options, policy: PolicyRuntime | None, pictures: list[GoalPictur
     spec = load_robot(options.out / 'robot.yaml').with_actions(DRIVE_ACTIONS)
     goals = load_goal_pictures(options.out / 'goals')
     robot = SimulatedRobot(
-        options.house, options.rooms, robot=spec, size=options.size, seed=options.seed,
-        stop=options.stop, randomisation=load_randomisation(options.randomisation),
+        house_scene(options.house, options.rooms), robot=spec, size=options.size,
+        seed=options.seed, stop=options.stop,
+        randomisation=load_randomisation(options.randomisation),
         goal_poses=[goal.pose for goal in goals])
     rng, deltas = np.random.default_rng(options.seed), np.column_stack([
         np.array(spec.moves), np.zeros(len(spec.actions))])

@@ -8,10 +8,12 @@ import sys
 from vn_nav.evaluation import EvaluateConfig, evaluate
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.resources import share_file
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scene, rooms_of
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.randomisation import load_randomisation
 
-UNSEEN_HOUSE = 8  # seed
+UNSEEN_HOUSE = 8  # seed, of a house with as many rooms
 
 
 def main(folder: str, episodes: int) -> dict:
@@ -19,13 +21,14 @@ def main(folder: str, episodes: int) -> dict:
     checkpoint = load_checkpoint(folder)
     info = checkpoint.info
 
-    def make_env(split, houses, environments, stop):
+    def make_env(split, scenes, environments, stop):
         return NavigationEnv(EnvConfig(
-            houses=tuple(houses), rooms=info['rooms'], num_envs=environments, stop=stop,
+            scenes=tuple(scenes), num_envs=environments, stop=stop,
             size=checkpoint.config.size, actions=checkpoint.config.actions,
             randomisation=load_randomisation(info['randomisation'])))
 
-    splits = {'own house': info['houses'][:1], 'unseen house': [UNSEEN_HOUSE]}
+    own = info['scenes'][0]
+    splits = {'own house': [own], 'unseen house': [house_scene(UNSEEN_HOUSE, rooms_of(own))]}
     config = EvaluateConfig(episodes=episodes, controls=('random actions',))
     result = evaluate(checkpoint, splits, make_env, config, name=folder).result
     for name, split in result['splits'].items():

@@ -7,7 +7,10 @@ import math
 import sys
 
 from vn_nav.learning import preset, train
-from vn_sim_bridge.navigation.env import PRIVILEGED, EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import PRIVILEGED, EnvConfig
+
+SCENE = 'house:7?rooms=1'
 
 
 def main(out: str, minutes: float):
@@ -16,11 +19,11 @@ def main(out: str, minutes: float):
     config = preset('fast', minutes=minutes, pair_minutes=0.0, channels=(8, 16, 16),
                     features=64, hidden=64)
     # What the policy never sees, but its losses need: poses and distances of the goal.
-    env = NavigationEnv(EnvConfig(houses=(7,), rooms=1, num_envs=16, size=36,
+    env = NavigationEnv(EnvConfig(scenes=(SCENE,), num_envs=16, size=36,
                                   progress_reward=1.0, collision_reward=-0.02,
                                   privileged=tuple(set(config.privileged) & set(PRIVILEGED))))
     facts = {'camera_fov_deg': math.degrees(env.robot.camera_fov),
-             'camera_height': env.robot.camera_height, 'houses': [7], 'rooms': 1}
+             'camera_height': env.robot.camera_height, 'scenes': [SCENE]}
     return train(env, config, out, info=facts, on_update=lambda row: print(
         f'{row["frames"]:,} frames, {row["fps"]:.0f} a second, success {row["success"]:.0%}'))
 

@@ -14,7 +14,7 @@ from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.robot import DRIVE_ACTIONS
-from vn_sim_bridge.floor.contacts import WORLD_VERSION
+from vn_sim_bridge.simulators.house import WORLD_VERSION
 
 PATIENCE = 100.0  # s for what has no limit of its own: starting a node on a loaded machine
 
@@ -33,7 +33,7 @@ def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=No
         torch.nn.init.zeros_(layer.weight)
         torch.nn.init.constant_(layer.bias, math.log(arrival / (1 - arrival)))
     save_checkpoint(folder, network, {'world_version': WORLD_VERSION, 'camera_fov_deg': 90.0,
-                                      'camera_height': 1.0, 'houses': [7], 'rooms': 5,
+                                      'camera_height': 1.0, 'scenes': ['house:7'],
                                       'stop_threshold': stop_threshold})
     return folder
 

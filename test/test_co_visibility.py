@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from vn_nav.co_visibility import FARTHEST, GRID, co_visible, lift, relative_pose
+from vn_nav.scenes import house_scenes
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.randomisation import load_randomisation
 
 
 @pytest.fixture(scope='module')
 def env():
-    env = NavigationEnv(EnvConfig(houses=(7, 8), num_envs=8, size=48,
+    env = NavigationEnv(EnvConfig(scenes=house_scenes((7, 8)), num_envs=8, size=48,
                                   randomisation=load_randomisation('standard'),
                                   privileged=('goal_pose', 'overlap', 'depth')))
     env.reset(seed=0)
@@ -35,14 +37,14 @@ def test_the_relative_pose_undoes_a_drive():
 def look(env, poses, seed=0):
     """Depth, cameras and fields of view from poses in the houses of the environments."""
     which = np.arange(len(poses))
-    dress = env.backend.appearance(seed, Stream.APPEARANCE, which, 0)
-    frames = env.backend.view(env.house_index, poses, None, dress)
-    return frames.depth.copy(), *env.backend.cameras(poses, dress)
+    dress = env.simulator.appearance(seed, Stream.APPEARANCE, which, 0)
+    frames = env.simulator.view(env.place_index, poses, None, dress)
+    return frames.depth.copy(), *env.simulator.cameras(poses, dress)
 
 
 def test_a_view_shares_everything_with_itself_and_nothing_with_its_back(env):
     poses = env.goal_poses[np.arange(8) % len(env.goal_poses)].copy()
-    poses[:, :2] = env.backend.poses[:, :2]
+    poses[:, :2] = env.simulator.poses[:, :2]
     depth, cameras, fov = look(env, poses)
     points = lift(depth, cameras, fov)
     assert (co_visible(points, depth, cameras, fov) == 1.0).all()
@@ -54,7 +56,7 @@ def test_a_view_shares_everything_with_itself_and_nothing_with_its_back(env):
 
 
 def test_points_lie_on_the_surfaces_that_are_seen(env):
-    depth, cameras, fov = look(env, env.backend.poses)
+    depth, cameras, fov = look(env, env.simulator.poses)
     points = lift(depth, cameras, fov)
     assert points.shape == (8, GRID * GRID, 3)
     assert points[..., 2].min() > -1e-3 and points[..., 2].max() < 2.6 + 1e-3
@@ -101,12 +103,12 @@ def test_the_environment_reports_the_share_that_brute_force_counts(env):
     for _ in range(6):
         view, variant = np.divmod(observation['goal_index'], variants)
         assert np.array_equal(view, info['goal'])
-        dress = env.backend.appearance(3, Stream.APPEARANCE, np.arange(8), env._episode)
-        goal_dress = env.backend.appearance(0, Stream.GOAL_APPEARANCE, view, variant)
+        dress = env.simulator.appearance(3, Stream.APPEARANCE, np.arange(8), env._episode)
+        goal_dress = env.simulator.appearance(0, Stream.GOAL_APPEARANCE, view, variant)
         goals = env.goal_poses[view]
-        goal_depth = env.backend.view(env.house_index, goals, None, goal_dress).depth
-        goal_cameras, goal_fov = env.backend.cameras(goals, goal_dress)
-        cameras, fov = env.backend.cameras(info['pose'], dress)
+        goal_depth = env.simulator.view(env.place_index, goals, None, goal_dress).depth
+        goal_cameras, goal_fov = env.simulator.cameras(goals, goal_dress)
+        cameras, fov = env.simulator.cameras(info['pose'], dress)
         for n in range(8):
             expected = brute_force(goal_cameras[n], goal_fov[n], goal_depth[n], cameras[n],
                                    fov[n], info['depth'][n])

@@ -35,4 +35,4 @@ def test_a_checkpoint_is_evaluated_from_python(capsys):
 
 def test_a_policy_is_trained_from_python(tmp_path):
     info = load_checkpoint(example('train').main(str(tmp_path / 'run'), 0.02)).info
-    assert info['frames'] > 0 and info['houses'] == [7] and info['preset'] == ''
+    assert info['frames'] > 0 and info['scenes'] == ['house:7?rooms=1'] and info['preset'] == ''

@@ -14,7 +14,7 @@ PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 # The leaves that the simulator may use, and what its node shares with the other nodes.
 LEAVES = {'vn_nav.arrival', 'vn_nav.errors', 'vn_nav.goal_picture', 'vn_nav.observation',
           'vn_nav.co_visibility', 'vn_nav.reset_arguments', 'vn_nav.resources', 'vn_nav.robot',
-          'vn_nav.structured_file'}
+          'vn_nav.scenes', 'vn_nav.structured_file'}
 NODE_SHARED = {'vn_nav.nodes.parameters', 'vn_nav.nodes.policy_parameters',
                'vn_nav.nodes.process', 'vn_nav.nodes.qos'}
 
@@ -85,6 +85,9 @@ def test_dependencies(path):
         assert 'argparse' not in roots(path), 'options of a command end in vn_nav.cli'
     if package == 'vn_sim_bridge':
         allowed = LEAVES | (NODE_SHARED if at_the_edge(path) else set())
+        if name_of(path) == 'vn_sim_bridge.simulators.recorded':
+            # Bags are read in one place.
+            allowed = allowed | {'vn_nav.bags.mapping.recorded_place'}
         used = {name for name in names if name.startswith('vn_nav.')
                 if (ROOT / name.replace('.', '/')).with_suffix('.py').is_file()}
         assert used <= allowed, f'the simulator knows only the leaves {sorted(allowed)}'

@@ -12,7 +12,8 @@ import pytest
 from paths import ROOT, TESTS
 
 from vn_nav.learning.presets import ENVIRONMENT
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 # Number in thesis-facts.md, section 6; the trap; the tests (of this file: without a file's name).
 TRAPS = {
@@ -62,7 +63,8 @@ TRAPS = {
 
 
 def make(**options):
-    return NavigationEnv(EnvConfig(**{'houses': (7,), 'num_envs': 8, 'size': 36} | options))
+    return NavigationEnv(EnvConfig(**{
+        'scenes': ('house:7',), 'num_envs': 8, 'size': 36} | options))
 
 
 def test_every_trap_has_its_tests():
@@ -164,7 +166,7 @@ def test_trap_11_labels_are_never_resized():
     assert 'vn_nav/observation.py' in found and found <= MAY_RESIZE
     env = make(privileged=('segmentation', 'goal_segmentation'))
     _, info = env.reset(seed=0)
-    classes = set(np.unique(env.backend.observe().labels))
+    classes = set(np.unique(env.simulator.observe().labels))
     assert info['segmentation'].shape == info['goal_segmentation'].shape == (8, 36, 36)
     assert set(np.unique(info['segmentation'])) <= classes
 

@@ -37,6 +37,7 @@ class TwoBars:
 
     action_names = ACTIONS
     world_version = 'two bars'
+    restorable = False
 
     def __init__(self, num_envs: int = 16, size: int = 36):
         self.num_envs, self.size = num_envs, size

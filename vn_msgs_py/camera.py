@@ -22,6 +22,11 @@ def intrinsics(width: int, height: int, fov: float) -> tuple[list[float], list[f
             [focal, 0.0, x, 0.0, 0.0, focal, y, 0.0, 0.0, 0.0, 1.0, 0.0])
 
 
+def field_of_view(width: float, height: float, focal: float) -> float:
+    """Of the shorter side [rad], of a camera with a focal length [pixels]; see `intrinsics`."""
+    return 2 * math.atan(min(width, height) / 2 / focal)
+
+
 def fill_camera_info(message: Any, width: int, height: int, fov: float) -> Any:
     """Describe a camera as of `intrinsics` in a CameraInfo; header and region stay the caller's.
 

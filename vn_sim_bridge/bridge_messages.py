@@ -12,7 +12,7 @@ import numpy as np
 from vn_msgs_py import motion
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
-from vn_sim_bridge.floor.contacts import WORLD_VERSION
+from vn_nav.scenes import parse_scene
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.robot import lidar
 from vn_sim_bridge.robot.odometry import Uncertainty
@@ -155,11 +155,14 @@ def fill_scan(message: Any, rects: np.ndarray, pose: np.ndarray, period: float) 
 
 
 def scene_facts(robot: SimulatedRobot) -> dict:
-    """What a viewer or a report needs to draw the house: the topic `scene`."""
+    """What a viewer or a report needs to draw the place: the topic `scene`."""
+    simulator, place = robot.simulator, robot.place
     return {
-        'world_version': WORLD_VERSION,
-        'rooms': len(robot.house.rooms),
-        **robot.house.floor_plan(),
+        'scene': place.name,
+        'simulator': parse_scene(place.name).simulator,
+        'world_version': simulator.version,
+        **({'rooms': len(place.rooms)} if simulator.capabilities.rooms else {}),
+        **(place.plan() or {}),
         'goals': [{'room': field.goal.room, 'pose': list(field.goal.pose)}
                   for field in robot.fields],
         'arrival': {'radius': tasks.ARRIVAL_RADIUS,

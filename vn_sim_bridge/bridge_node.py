@@ -1,6 +1,6 @@
-"""`sim_bridge_node`: an embedded house as a robot on ROS topics. It reads velocities alone.
+"""`sim_bridge_node`: a simulator as a robot on ROS topics. It reads velocities alone.
 
-Run: `ros2 run vn_nav sim_bridge_node --ros-args -p house:=7 -p rooms:=5`. Two of them on one
+Run: `ros2 run vn_nav sim_bridge_node --ros-args -p scene:=house:7`. Two of them on one
 graph: each in a namespace, where its clock is too; nodes that live in its time are told so with
 `-r /clock:=clock` (as `sim.launch.py` does).
 """
@@ -34,9 +34,8 @@ from vn_nav.nodes.qos import offered, qos
 from vn_nav.robot import RobotSpec, load_robot
 from vn_sim_bridge import bridge_messages, bridge_sensors
 from vn_sim_bridge.bridge_messages import Frames
-from vn_sim_bridge.bridge_parameters import PARAMETERS, first_stamp
+from vn_sim_bridge.bridge_parameters import PARAMETERS, first_stamp, scene_of
 from vn_sim_bridge.bridge_sensors import Sensors
-from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.goal_pictures import load_goal_pictures
 from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
@@ -71,10 +70,11 @@ class SimBridgeNode(Node):
         self.picture_ticks = max(1, round(1 / (values['camera_rate'] * TICK)))
         robot = load_robot(values['robot']) if values['robot'] else RobotSpec()
         self.goals = load_goal_pictures(values['goals']) if values['goals'] else []
-        work = f'making house {values["house"]}; the first start compiles the renderer, a minute'
+        scene = scene_of(values)
+        work = f'opening {scene}; the first start compiles the renderer, a minute'
         with compiling(self, ended, work):
             self.robot = SimulatedRobot(
-                values['house'], values['rooms'], robot=robot, size=values['size'],
+                scene, robot=robot, size=values['size'],
                 noise=values['noise'], seed=values['seed'],
                 max_decisions=values['max_decisions'], stop=values['stop'],
                 randomisation=load_randomisation(values['randomisation']),
@@ -98,11 +98,17 @@ class SimBridgeNode(Node):
         with compiling(self, ended, work):
             self.begin(0)
         self.get_logger().info(
-            f'ready: house {values["house"]}, {values["time"]}; pictures on '
+            f'ready: {scene}, {values["time"]}; pictures on '
             f'{self.resolve_topic_name("image_raw")}, waits for commands on '
             f'{self._listener.topic_name}')
         self.begun = time.monotonic()
         self._behind_said = 0
+
+    def destroy_node(self) -> None:
+        """Let go of the simulator as well."""
+        if hasattr(self, 'robot'):
+            self.robot.close()
+        super().destroy_node()
 
     def _other_clocks(self) -> list[str]:
         """Who else publishes on the clock's topic."""
@@ -136,6 +142,8 @@ class SimBridgeNode(Node):
         kinds = dict(zip(bridge_sensors.TOPICS, (
             Image, CompressedImage, CameraInfo, Image, CameraInfo, Image, LaserScan, Odometry,
             Odometry), strict=True))
+        can = self.robot.simulator.capabilities
+        kinds = {name: kinds[name] for name in bridge_sensors.topics(can)}
         try:  # in no wheel
             transforms = importlib.import_module('tf2_msgs.msg').TFMessage
             kinds |= {'/tf': transforms, '/tf_static': transforms}
@@ -145,7 +153,7 @@ class SimBridgeNode(Node):
             {name: publisher(kind, name) for name, kind in kinds.items()}, self.robot,
             self.frames, size=values['size'], period=self.picture_ticks * TICK,
             localised=values['localised'], transform=TransformStamped)
-        self._label_names = publisher(String, 'labels/names')
+        self._label_names = publisher(String, 'labels/names') if can.labels else None
         self._collision = publisher(Bool, 'collision')
         self._scene = publisher(String, 'scene')
         self._diagnostics = publisher(DiagnosticArray, '/diagnostics')
@@ -164,7 +172,9 @@ class SimBridgeNode(Node):
             self.create_subscription(Bool, 'arrived', self._on_arrived, qos('arrived', depth=10))
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_timer(REPORT, self._report, clock=NodeClock(clock_type=ClockType.STEADY_TIME))
-        self._label_names.publish(String(data=json.dumps(list(LABELS))))
+        if self._label_names is not None:
+            self._label_names.publish(String(data=json.dumps(
+                list(self.robot.simulator.label_names))))
         self._scene.publish(String(data=json.dumps(bridge_messages.scene_facts(self.robot))))
         self._sensors.publish_mounts(self.stamp())
 

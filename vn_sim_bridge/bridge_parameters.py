@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from vn_sim_bridge.navigation.env import STOPS
+from vn_nav.errors import UserError
+from vn_nav.scenes import ROOMS, house_scene, scene_name
+from vn_sim_bridge.navigation.env_config import STOPS
 from vn_sim_bridge.robot.simulated_robot import TICK
 
 DAY = 86_400.0  # s
 # name: (default, meaning, limits), as in `vn_nav.nodes.parameters`.
 PARAMETERS = {
-    'backend': ('house', 'simulator behind the bridge: house', ('house',)),
-    'house': (0, 'seed of the house'),
-    'rooms': (5, 'number of rooms', (1, 12)),
+    'scene': ('', 'where: house:7, house:7?rooms=3, bag:my_drive (vn_nav simulators); empty: see '
+              'house'),
+    'backend': ('house', 'of the scene that house and rooms name: house', ('house',)),
+    'house': (0, 'seed of a house, in place of scene'),
+    'rooms': (ROOMS, 'number of its rooms', (1, 12)),
     'robot': ('', 'YAML file of the robot; empty: the standard robot'),
     'size': (84, 'side of the square camera picture [pixels]', (16, 1024)),
     'noise': (True, 'Gaussian motion noise, which odom does not see'),
@@ -54,3 +58,19 @@ def first_stamp(start_time: float, *, lock_step: bool, wall: float) -> float:
         return start_time
     # Whole milliseconds; zero would mean "no time yet".
     return max(1.0, round(wall % DAY if lock_step else wall, 3))
+
+
+def scene_of(values: dict) -> str:
+    """The scene that the parameters name.
+
+    Raises:
+        UserError: `scene` together with `house` or `rooms`, or no scene's name.
+    """
+    if not values['scene']:
+        return house_scene(values['house'], values['rooms'])
+    for name in ('house', 'rooms'):
+        if values[name] != PARAMETERS[name][0]:
+            raise UserError('a scene is named by scene, or by house and rooms',
+                            f'scene:={values["scene"]} and {name}:={values[name]}',
+                            'leave one of them out')
+    return scene_name(values['scene'])

@@ -14,16 +14,25 @@ from vn_msgs_py import camera, images, motion
 from vn_sim_bridge import bridge_messages
 from vn_sim_bridge.bridge_messages import Frames, Transform
 from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
+from vn_sim_bridge.simulator import Capabilities
 
+# Topics of sensors that not every simulator has, by the capability that they need.
+NEEDS = {'depth/image_raw': 'depth', 'depth/camera_info': 'depth', 'labels/image_raw': 'labels',
+         'scan': 'walls'}
 TOPICS = ('image_raw', 'image_raw/compressed', 'camera_info', 'depth/image_raw',
           'depth/camera_info', 'labels/image_raw', 'scan', 'odom', 'ground_truth/odom')
+
+
+def topics(capabilities: Capabilities) -> list[str]:
+    """Those of `TOPICS` that a simulator has something to say on."""
+    return [name for name in TOPICS if name not in NEEDS or getattr(capabilities, NEEDS[name])]
 
 
 class Sensors:
     """Publishes what the robot's sensors say.
 
     Args:
-        publishers: of `TOPICS`, and of /tf and /tf_static where there are any.
+        publishers: of `topics`, and of /tf and /tf_static where there are any.
         robot: whose sensors they are.
         frames: names of its frames.
         size: side of the pictures [pixels].
@@ -44,7 +53,7 @@ class Sensors:
         return self._out[name].msg_type()
 
     def _listened(self, name: str) -> bool:
-        return self._out[name].get_subscription_count() > 0
+        return name in self._out and self._out[name].get_subscription_count() > 0
 
     def _publish(self, name: str, message: Any, stamp: Any, frame: str) -> None:
         message.header.stamp, message.header.frame_id = stamp, frame
@@ -70,7 +79,7 @@ class Sensors:
         """Publish a scan, if somebody listens."""
         if self._listened('scan'):
             message = bridge_messages.fill_scan(
-                self._make('scan'), self._robot.house.obstacle_rects, self._robot.pose,
+                self._make('scan'), self._robot.place.obstacle_rects, self._robot.pose,
                 self._period)
             self._publish('scan', message, stamp, self._frames.lidar)
 

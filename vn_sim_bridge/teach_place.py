@@ -13,10 +13,11 @@ import numpy as np
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.datasets.recorded_pairs import GraphPairs
 from vn_sim_bridge.datasets.recorded_views import GraphViews
-from vn_sim_bridge.houses.house import CELL
-from vn_sim_bridge.navigation.env import PRIVILEGED, EnvConfig, NavigationEnv
+from vn_sim_bridge.floor.floor_map import CELL
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import PRIVILEGED, EnvConfig
 from vn_sim_bridge.recorded.image_graph import ImageGraph, build_graph
-from vn_sim_bridge.simulators.recorded import ImageGraphBackend
+from vn_sim_bridge.simulators.recorded import RecordedSimulator
 
 __all__ = ['build_graph', 'draw_map', 'held_out', 'make_env', 'make_pairs', 'make_views',
            'regrets']
@@ -48,15 +49,15 @@ def make_env(graph: ImageGraph, robot: RobotSpec, envs: int, *, privileged: tupl
         robot: with the policy's actions alone.
         envs: robots.
         privileged: outputs that are asked for; what any environment tells is none of them.
-        draw, light: see `ImageGraphBackend`.
+        draw, light: see `RecordedSimulator`.
         options: further fields of `EnvConfig`.
     """
     config = EnvConfig(
         num_envs=envs, size=graph.pictures.shape[-1], actions=robot.action_names,
         privileged=tuple(sorted(set(privileged) & set(PRIVILEGED))), **options)
     return NavigationEnv(config, robot,
-                         backend=ImageGraphBackend(graph, envs, robot=robot, draw=draw,
-                                                   light=light))
+                         simulator=RecordedSimulator(graph, envs, robot=robot, draw=draw,
+                                                     light=light))
 
 
 def make_pairs(own: ImageGraph, others: ImageGraph | None, robot: RobotSpec, seed: int

@@ -27,6 +27,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from vn_nav.scenes import house_scenes
+
 PARTS = ('render', 'train', 'learn', 'export')
 PRESETS = ('a2c', 'unreal', 'thesis', 'fast')
 LEARNED = ('fast', 'thesis')
@@ -96,7 +98,7 @@ def clear(device: str) -> None:
 
 def device_env(arguments, **options):
     """The environment on the device."""
-    from vn_sim_bridge.navigation.env import EnvConfig
+    from vn_sim_bridge.navigation.env_config import EnvConfig
     from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     return WarpNavigationEnv(EnvConfig(**options), device=arguments.device)
 
@@ -121,8 +123,9 @@ def rate(step, frames: int, device: str, seconds: float) -> list[float]:
 
 def agreement(arguments) -> dict:
     """How far the device's pictures are from the Numba renderer's, on the same episodes."""
-    from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
-    config = {'houses': (1, 2, 3), 'rooms': 6, 'num_envs': 48}
+    from vn_sim_bridge.navigation.env import NavigationEnv
+    from vn_sim_bridge.navigation.env_config import EnvConfig
+    config = {'scenes': house_scenes((1, 2, 3), 6), 'num_envs': 48}
     host, other = NavigationEnv(EnvConfig(**config)), device_env(arguments, **config)
     host.reset(seed=0)
     other.reset(seed=0)
@@ -131,7 +134,7 @@ def agreement(arguments) -> dict:
         actions = rng.integers(0, len(host.action_names), 48)
         mine, *_, facts = host.step(actions)
         theirs, *_, device_facts = other.step(torch.from_numpy(actions).to(arguments.device))
-    labels = host.backend.observe().labels
+    labels = host.simulator.observe().labels
     gap = np.abs(mine['image'].astype(int) - theirs['image'].cpu().numpy().astype(int))
     return {'labels_equal': float((labels == device_facts['segmentation'].cpu().numpy()).mean()),
             'rgb_within_2': float((gap <= 2).mean()),
@@ -147,7 +150,7 @@ def render(arguments):
         for envs in arguments.envs:
             conditions = f'{size} x {size}, {envs} environments, 16 houses of six rooms'
             try:
-                env = device_env(arguments, houses=tuple(range(16)), rooms=6, num_envs=envs,
+                env = device_env(arguments, scenes=house_scenes(range(16), 6), num_envs=envs,
                                  size=size)
                 env.reset(seed=0)
                 actions = torch.randint(0, len(env.action_names), (envs,),
@@ -180,10 +183,10 @@ def run_training(arguments, name: str, envs: int, minutes: float, folder: Path, 
     told = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap'}
     world = {**ENVIRONMENT[name], **world, 'num_envs': envs}
     del world['envs']
-    env = device_env(arguments, houses=houses, rooms=rooms, size=arguments.train_size,
+    env = device_env(arguments, scenes=house_scenes(houses, rooms), size=arguments.train_size,
                      privileged=tuple(sorted(set(config.privileged) & told)), **world)
     rows = []
-    facts = FACTS | {'world_version': env.world_version, 'houses': list(houses), 'rooms': rooms,
+    facts = FACTS | {'world_version': env.world_version, 'scenes': list(env.config.scenes),
                      'preset': name, 'notes': f'Trained on {hardware(arguments.device)}.'}
     train(env, config, folder, info=facts, on_update=rows.append)
     return rows
@@ -270,7 +273,7 @@ def export(arguments, name: str):
     from vn_nav.policy.checkpoint import load_checkpoint
     checkpoint = load_checkpoint(arguments.curves / name / 'checkpoint')
     size, steps = checkpoint.config.size, 100
-    env = device_env(arguments, houses=(HOUSE,), rooms=ROOMS, num_envs=1, size=size)
+    env = device_env(arguments, scenes=house_scenes((HOUSE,), ROOMS), num_envs=1, size=size)
     draws = torch.Generator().manual_seed(0)
     seen, info = env.reset(seed=0)
     rows = []

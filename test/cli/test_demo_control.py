@@ -19,7 +19,7 @@ from vn_nav.robot import load_robot
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
 
-EPISODES = 6
+EPISODES, HOUSE = 6, 'house:7'
 BAG = ROOT / 'bags' / 'house_drive'
 
 
@@ -28,12 +28,12 @@ BAG = ROOT / 'bags' / 'house_drive'
 def test_the_control_without_ros_has_the_same_goals_pictures_starts_and_lights(tmp_path, size):
     checkpoint = load_checkpoint(write_checkpoint(tmp_path / 'checkpoint', size=size))
     checkpoint.info['randomisation'] = 'standard'
-    told = demo.bridge_parameters(checkpoint, 7, EPISODES, 50)
+    told = demo.bridge_parameters(checkpoint, HOUSE, EPISODES, 50)
     robot = SimulatedRobot(  # as the bridge makes it out of its parameters
-        told['house'], told['rooms'], robot=load_robot(told['robot']), size=told['size'],
+        told['scene'], robot=load_robot(told['robot']), size=told['size'],
         seed=told['seed'], max_decisions=told['max_decisions'], stop=told['stop'],
         randomisation=load_randomisation(told['randomisation']))
-    env = demo.control_env(make_env, checkpoint, 7, EPISODES, 50)
+    env = demo.control_env(make_env, checkpoint, HOUSE, EPISODES, 50)
     seen, info = env.reset(seed=demo.SEED)
     assert (env.action_names, env.config.stop) == (checkpoint.config.actions, robot.stop_rule)
     for k in range(EPISODES):

@@ -14,6 +14,7 @@ from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.scenes import house_scenes as named
 from vn_sim_bridge.datasets.collect import REACH, VIEWS, HouseScene, collect, house_scenes, legs
 from vn_sim_bridge.datasets.house_pairs import PairSampler
 from vn_sim_bridge.houses.labels import LABELS
@@ -25,7 +26,7 @@ ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 
 def record(folder, houses=(3, 4), pictures=90, randomisation=None, seed=0):
     """A bag of a few rooms."""
-    scenes = house_scenes(houses, 2, 36, ROBOT, randomisation or Randomisation(), seed, 1)
+    scenes = house_scenes(named(houses, 2), 36, ROBOT, randomisation or Randomisation(), seed, 1)
     return collect(scenes, len(houses), pictures, ROBOT, lambda topics: BagWriter(folder, topics))
 
 
@@ -134,7 +135,7 @@ class Blind:
     label_names, facts = (), {}
 
     def __init__(self, scene):
-        self.backend = type('Backend', (), {'capabilities': Capabilities(
+        self.simulator = type('Backend', (), {'capabilities': Capabilities(
             continuous=False, depth=False, labels=False, geodesic=False, tilt=False)})
         self.look = scene.look
 
@@ -151,7 +152,7 @@ def test_too_little_to_collect_is_refused_before_anything_is_written(tmp_path):
         with pytest.raises(UserError, match='two pictures'):
             record(tmp_path / 'bag', houses, pictures)
     with pytest.raises(UserError, match='rooms'):
-        collect(house_scenes((3,), 99, 36, ROBOT, Randomisation(), 0, 1), 1, 8, ROBOT,
+        collect(house_scenes(named((3,), 99), 36, ROBOT, Randomisation(), 0, 1), 1, 8, ROBOT,
                 lambda topics: BagWriter(tmp_path / 'bag', topics))
     assert not (tmp_path / 'bag').exists()
 

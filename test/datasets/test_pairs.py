@@ -7,12 +7,13 @@ import pytest
 
 from vn_nav.errors import UserError
 from vn_sim_bridge.datasets.house_pairs import PairSampler
-from vn_sim_bridge.houses.house import Goal
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.navigation import env as env_module
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.navigation.tasks import arrived, heading_error
 from vn_sim_bridge.render.randomisation import load_randomisation
+from vn_sim_bridge.simulator import Goal
+from vn_sim_bridge.simulators import house as house_module
 
 
 @pytest.fixture(scope='module')
@@ -111,7 +112,7 @@ def test_arrival_is_the_tasks_own(sampler):
     house, poses, goal_poses = sampler.poses(np.arange(1500))
     found = sampler.arrived(house, poses, goal_poses)
     expected = [
-        arrived(sampler.houses[h].geodesic(*goal[:2]).distance(pose[None, :2])[0],
+        arrived(sampler.houses[h].geodesic(*goal[:2]).at(pose[None, :2])[0],
                 heading_error(pose[2], goal[2]))
         for h, pose, goal in zip(house, poses, goal_poses, strict=True)]
     assert np.array_equal(found, expected) and found.sum() > 80
@@ -122,12 +123,12 @@ def test_labels_and_pictures_are_those_of_the_environment(monkeypatch):
     pairs = sampler.draw(24)
     goals = tuple(Goal(tuple(pose), 'kitchen') for pose in pairs['goal_place'])
     house = dataclasses.replace(generate_house(7, rooms=3), goals=goals)
-    monkeypatch.setattr(env_module, 'generate_house', lambda *_, **__: house)
+    monkeypatch.setattr(house_module, 'generate_house', lambda *_, **__: house)
     env = NavigationEnv(EnvConfig(
-        houses=(7,), rooms=3, num_envs=24, size=36, one_goal_per_env=True, stop='declared',
+        scenes=('house:7?rooms=3',), num_envs=24, size=36, one_goal_per_env=True, stop='declared',
         privileged=('goal_pose', 'overlap', 'depth', 'segmentation', 'goal_segmentation')))
     env.reset(seed=0)
-    env.backend.place(np.arange(24), pairs['pose'])
+    env.simulator.place(np.arange(24), pairs['pose'])
     observation, _, terminated, _, info = env.step(np.full(24, env.declare_action))
     assert terminated.all() and np.array_equal(info['success'], pairs['arrived'])
     assert np.array_equal(observation['image'], pairs['image'])

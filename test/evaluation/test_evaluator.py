@@ -13,13 +13,15 @@ from vn_nav.evaluation.evaluator import (
     measure,
     random_actor,
     run_episodes,
+    split_figures,
 )
 from vn_nav.evaluation.metrics import Episode
 from vn_nav.policy.network import NetworkConfig, Policy
 from vn_nav.report import tables
 from vn_nav.report.evaluation_page import choose, evaluation_page, outcome
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 ROWS = ['right goal, sample', 'right goal, greedy', 'wrong goal', 'blank goal', 'random actions',
         'shortest path']
@@ -31,8 +33,8 @@ def make_network(**fields):
                                    'features': 16, 'hidden': 16} | fields))
 
 
-def make_env(houses=(7,), environments=6, stop='arrival', *, limit=40):
-    return NavigationEnv(EnvConfig(houses=tuple(houses), num_envs=environments, size=36,
+def make_env(scenes=('house:7',), environments=6, stop='arrival', *, limit=40):
+    return NavigationEnv(EnvConfig(scenes=tuple(scenes), num_envs=environments, size=36,
                                    max_decisions=limit, stop=stop))
 
 
@@ -49,7 +51,7 @@ def test_every_environment_gives_the_same_number_of_episodes():
         assert one.start_distance >= 1.0 and 1 <= one.decisions <= 40
         assert one.collisions <= one.decisions and one.reward == float(one.success)
         assert one.seconds > 0.5 * one.decisions
-        assert one.scene == 7 and one.declared is None and one.reached == one.success
+        assert one.scene == 'house:7' and one.declared is None and one.reached == one.success
 
 
 def test_trajectories_are_the_episodes():
@@ -62,16 +64,16 @@ def test_trajectories_are_the_episodes():
         assert len(one.contacts) == one.collisions
         assert one.success
         assert np.hypot(*(one.trajectory[-1, :2] - one.goal_pose[:2])) <= 0.6
-        house = env.houses[0]
+        house = env.places[0]
         assert house.room_at(*one.goal_pose[:2]) == one.goal
         field = house.geodesic(*one.goal_pose[:2])
-        start = field.distance(one.trajectory[:1, :2])[0]
+        start = field.at(one.trajectory[:1, :2])[0]
         assert start == pytest.approx(one.start_distance, abs=1e-3)
 
 
 def test_every_control_and_equal_starts():
-    rows = measure(functools.partial(make_env, limit=60), make_network(), [7], decoding='sample',
-                   episodes=10)
+    rows = measure(functools.partial(make_env, limit=60), make_network(), ['house:7'],
+                   decoding='sample', episodes=10)
     assert list(rows) == ['arrival'] and list(rows['arrival']) == ROWS
     found = figures(rows)['arrival']
     assert found['shortest path']['success'] >= 0.9
@@ -80,12 +82,12 @@ def test_every_control_and_equal_starts():
 
 
 def test_houses_add_up_to_the_total():
-    houses = [7, 8, 10_000]
-    rows = measure(functools.partial(make_env, limit=50), make_network(), houses,
+    named = ['house:7', 'house:8', 'house:10000']
+    rows = measure(functools.partial(make_env, limit=50), make_network(), named,
                    decoding='sample', episodes=10, controls=('shortest path',))
     total = figures(rows)['arrival']
     scenes = {seed: figures(own)['arrival'] for seed, own in by_scene(rows).items()}
-    assert sorted(scenes) == houses
+    assert list(scenes) == named
     for name, whole in total.items():
         parts = [own[name] for own in scenes.values()]
         assert [part['episodes'] for part in parts] == [4, 4, 4] and whole['episodes'] == 12
@@ -113,7 +115,7 @@ def test_how_often_the_action_filter_acts_is_a_figure():
     total = np.sum([episode.filtered for episode in episodes], axis=0)
     assert 0 < total[1] < total[0] <= sum(rows[0].sum() for rows in counted)
     assert total[0] < sum(episode.decisions for episode in episodes)
-    rows = measure(functools.partial(make_env, limit=30), network, [7], decoding='sample',
+    rows = measure(functools.partial(make_env, limit=30), network, ['house:7'], decoding='sample',
                    episodes=6, controls=('random actions',))
     own = figures(rows)['arrival']
     shares = own['right goal, sample']
@@ -122,7 +124,7 @@ def test_how_often_the_action_filter_acts_is_a_figure():
     assert f'filter acted {shares["filter_acted"]:.1%}' in tables.row_line('own', shares,
                                                                            'arrival')
     assert 'filter changed' in tables.rows_html(own, 'arrival')
-    without = measure(functools.partial(make_env, limit=10), make_network(), [7],
+    without = measure(functools.partial(make_env, limit=10), make_network(), ['house:7'],
                       decoding='sample', episodes=6, controls=())
     assert 'filter' not in tables.rows_html(figures(without)['arrival'], 'arrival')
 
@@ -131,19 +133,21 @@ def test_many_houses_are_measured_in_parts(monkeypatch):
     """As if they were in memory at once, except for the seeds of the later parts."""
     made = []
 
-    def make(houses, environments, stop):
-        made.append((houses, environments))
-        return make_env(houses, environments, stop, limit=10)
-    monkeypatch.setattr('vn_nav.evaluation.evaluator.HOUSES_AT_ONCE', 2)
-    rows = measure(make, make_network(), [7, 8, 9], decoding='greedy', episodes=5, controls=())
-    assert made == [([7, 8], 4), ([9], 2)]
+    def make(scenes, environments, stop):
+        made.append((scenes, environments))
+        return make_env(scenes, environments, stop, limit=10)
+    monkeypatch.setattr('vn_nav.evaluation.evaluator.SCENES_AT_ONCE', 2)
+    rows = measure(make, make_network(), ['house:7', 'house:8', 'house:9'],
+                   decoding='greedy', episodes=5, controls=())
+    assert made == [(['house:7', 'house:8'], 4), (['house:9'], 2)]
     episodes = rows['arrival']['right goal, greedy']
-    assert sorted(e.scene for e in episodes) == [7, 7, 8, 8, 9, 9]
+    assert sorted(e.scene for e in episodes) == [
+        f'house:{seed}' for seed in (7, 7, 8, 8, 9, 9)]
 
 
 def test_a_declared_stop_is_measured_beside_arrival():
     network = make_network(heads=('arrival',))
-    rows = measure(make_env, network, [7], decoding='sample', episodes=6, threshold=0.0)
+    rows = measure(make_env, network, ['house:7'], decoding='sample', episodes=6, threshold=0.0)
     assert list(rows) == ['arrival', 'declared'] and list(rows['declared']) == ROWS
     # Above 0 is every probability: the policy declares at once, and is wrong, a metre off or more.
     found = figures(rows)['declared']
@@ -153,7 +157,7 @@ def test_a_declared_stop_is_measured_beside_arrival():
     assert found['shortest path']['success'] >= 0.9
     assert found['shortest path']['false_stops'] == 0.0
     # Below 1 is every one: it never declares, and nothing ends before the limit.
-    never = figures(measure(make_env, network, [7], decoding='sample', episodes=6,
+    never = figures(measure(make_env, network, ['house:7'], decoding='sample', episodes=6,
                             controls=(), threshold=0.999))['declared']['right goal, sample']
     assert never['declared'] == never['false_stops'] == never['success'] == 0.0
     assert never['decisions'] == 40
@@ -171,14 +175,12 @@ def test_the_policy_declares_where_its_head_says_so():
     assert declared.any() and not declared.all()
 
 
-def result_and_rows(stop_threshold=0.0, houses=(7, 8)):
-    rows = measure(make_env, make_network(heads=('arrival',)), list(houses), decoding='sample',
+def result_and_rows(stop_threshold=0.0, scenes=('house:7', 'house:8')):
+    rows = measure(make_env, make_network(heads=('arrival',)), list(scenes), decoding='sample',
                    episodes=8, controls=('wrong goal', 'random actions'), threshold=stop_threshold)
-    split = {'houses': list(houses), 'rows': figures(rows),
-             'scenes': {str(seed): figures(own) for seed, own in by_scene(rows).items()}}
     return {'checkpoint': 'a <b> run', 'world_version': '2', 'task': 'image',
             'decoding': 'sample', 'max_decisions': 40, 'seed': 0, 'date': '2026-11-24',
-            'splits': {'houses': split}}, {'houses': rows}
+            'splits': {'scenes': split_figures(rows, scenes)}}, {'scenes': rows}
 
 
 PLAN = {'bounds': [0, 0, 9, 6], 'walls': [[0, 0, 9, 0.1]], 'outside': [],
@@ -188,18 +190,18 @@ PLAN = {'bounds': [0, 0, 9, 6], 'walls': [[0, 0, 9, 0.1]], 'outside': [],
 
 def test_the_page_has_a_map_an_episode_and_needs_nothing_else():
     result, rows = result_and_rows()
-    plans = {'houses': {7: PLAN, 8: PLAN}}
+    plans = {'scenes': {'house:7': PLAN, 'house:8': PLAN}}
     page = evaluation_page(result, rows, plans, maps=5)
     assert page.count('<svg') == page.count('<polyline') == 5
     assert page.count('>false stop<') == 5 and 'a &lt;b&gt; run' in page
     for outside in ('src=', 'href=', '<script', '<link', '@import', 'url('):
         assert outside not in page
-    assert page.count('<table') == 4  # both kinds of stop, together and by house
+    assert page.count('<table') == 4  # both kinds of stop, together and by scene
     assert 'nan' not in page
     assert evaluation_page(result, rows, plans, maps=0).count('<svg') == 0
 
 
-def shown(success, start=3.0, scene=7, **fields):
+def shown(success, start=3.0, scene='house:7', **fields):
     return Episode(success=success, start_distance=start, path_length=3.0, decisions=9,
                    collisions=0, seconds=9.0, stop_distance=0.1, stop_heading=0.1, scene=scene,
                    **fields)

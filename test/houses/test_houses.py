@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.houses.house import CELL, clearance, main_component
+from vn_sim_bridge.floor.floor_map import CELL, clearance, main_component
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.layout import DOOR_WIDTH
 from vn_sim_bridge.houses.looks import STANDARD, UNSEEN
@@ -31,7 +31,7 @@ def test_every_room_has_a_goal_and_every_free_cell_is_reachable(rooms):
         free = house.floor.free
         assert np.array_equal(main_component(free), free)
         for goal in house.goals:
-            distance = house.geodesic(*goal.pose[:2]).distance(house.floor.centres())
+            distance = house.geodesic(*goal.pose[:2]).at(house.floor.centres())
             assert np.isfinite(distance).all()
             assert house.room_at(*goal.pose[:2]) == goal.room
 
@@ -60,7 +60,7 @@ def test_geodesic_distance_in_the_open_is_the_straight_line():
     cells = house.floor.centres()
     room = clearance(house.floor.origin, house.floor.free.shape, house.obstacle_rects)
     start = cells[np.argmax(room[house.floor.free])]  # where there is most room around
-    distance = house.geodesic(*start).distance(cells)
+    distance = house.geodesic(*start).at(cells)
     straight = np.hypot(*(cells - start).T)
     near = straight < room.max() - 0.2
     assert near.sum() > 30
@@ -73,8 +73,8 @@ def test_geodesic_distance_goes_through_doors():
     field = house.geodesic(*house.goals[0].pose[:2])
     others = np.array([goal.pose[:2] for goal in house.goals[1:]])
     straight = np.hypot(*(others - house.goals[0].pose[:2]).T)
-    assert (field.distance(others) >= straight - 0.02).all()
-    assert (field.distance(others) > straight + 0.3).any()
+    assert (field.at(others) >= straight - 0.02).all()
+    assert (field.at(others) > straight + 0.3).any()
 
 
 @pytest.mark.parametrize('seed, rooms', [(-1, 5), (13_000, 5), (1.5, 5), (0, 0), (0, 13)])

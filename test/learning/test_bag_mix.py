@@ -20,7 +20,8 @@ from vn_nav.learning.rollout import Collector
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 FACTS = {'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
 CONFIG = TrainConfig(frames=900, rollout_length=16, channels=(8, 8, 8), features=24, hidden=16,
@@ -37,7 +38,8 @@ def one_thread():
 
 
 def make_env():
-    return NavigationEnv(EnvConfig(houses=(3,), rooms=1, num_envs=8, size=36, max_decisions=40,
+    return NavigationEnv(EnvConfig(scenes=('house:3?rooms=1',), num_envs=8, size=36,
+                                   max_decisions=40,
                                    actions=ROBOT.action_names,
                                    privileged=('goal_pose', 'overlap')))
 

@@ -23,11 +23,13 @@ from vn_nav.learning.trainer import train
 from vn_nav.learning.training import STATE
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 TOLD = ('depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap')
-CONFIG = EnvConfig(houses=(3, 7), rooms=2, num_envs=6, size=36, max_decisions=12, seed=0,
+CONFIG = EnvConfig(scenes=house_scenes((3, 7), 2), num_envs=6, size=36, max_decisions=12, seed=0,
                    progress_reward=1.0, collision_reward=-0.02, step_reward=-0.01, goal_bonus=9.0,
                    privileged=TOLD)
 KEYS = (*TOLD, 'arrived', 'distance')
@@ -295,7 +297,8 @@ def test_states_go_on_exactly():
 
 def test_what_the_device_lacks_is_said(capsys, monkeypatch):
     with pytest.raises(UserError, match='imitation=0'):
-        device_env(EnvConfig(houses=(3,), rooms=1, num_envs=1, privileged=('explorer_action',)))
+        device_env(EnvConfig(scenes=('house:3?rooms=1',), num_envs=1,
+                             privileged=('explorer_action',)))
     with pytest.raises(UserError, match='cuda:0'):
         preset('fast', device='gpu')
     monkeypatch.setattr(torch.cuda, 'device_count', lambda: 0)

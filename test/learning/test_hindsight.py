@@ -19,7 +19,9 @@ from vn_nav.learning.hindsight import (
     rows_of,
     split,
 )
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 STEPS = 100  # of a robot in a house
 
@@ -92,12 +94,13 @@ def test_one_bag_without_depth_does_not_spoil_that_of_the_other():
 
 def house_drive(houses=(3, 4)):
     """Shortest-path drives through two houses, with depth."""
-    env = NavigationEnv(EnvConfig(houses=houses, num_envs=8, size=36, max_decisions=60,
+    env = NavigationEnv(EnvConfig(scenes=house_scenes(houses), num_envs=8, size=36,
+                                  max_decisions=60,
                                   privileged=('depth', 'oracle_action')))
     seen, info = env.reset(seed=0)
     rows = []
     for _ in range(STEPS):
-        before = (seen['image'].copy(), env.backend.poses[:, :3].copy(), info['depth'].copy(),
+        before = (seen['image'].copy(), env.simulator.poses[:, :3].copy(), info['depth'].copy(),
                   info['oracle_action'].astype(np.int16))
         seen, _, _, _, info = env.step(before[-1].astype(np.int64))
         rows.append((*before, info['reset'].copy()))  # True: it showed how an episode ended

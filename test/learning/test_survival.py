@@ -27,7 +27,8 @@ from vn_nav.learning.state_file import read_state, remove_partial
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import NetworkConfig, Policy
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 KILLS = int(os.environ.get('VN_NAV_KILLS', 20))  # of all presets together; more in `make soak`
 FACTS = {'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
@@ -184,7 +185,8 @@ SMALL_THESIS = preset('thesis', frames=700, rollout_length=8, hidden=16, bf16=Fa
 
 
 def house_env():
-    return NavigationEnv(EnvConfig(houses=(3,), rooms=1, num_envs=4, size=36, max_decisions=40,
+    return NavigationEnv(EnvConfig(scenes=('house:3?rooms=1',), num_envs=4, size=36,
+                                   max_decisions=40,
                                    privileged=('depth', 'goal_segmentation', 'segmentation')))
 
 

@@ -44,12 +44,11 @@ from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge import teach_place as place
-from vn_sim_bridge.floor.contacts import WORLD_VERSION
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.recorded.image_graph import build_graph
 from vn_sim_bridge.robot.joystick import Joystick
 from vn_sim_bridge.robot.simulated_robot import TICK
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulators.house import WORLD_VERSION, HouseSimulator
 from vn_sim_bridge.teach_place import draw_map, held_out, make_env, make_pairs
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
@@ -60,16 +59,16 @@ EVERY = 4  # ticks between two pictures
 def drive(seconds, rooms=1, house=7, size=SIZE):
     """Poses [N,3] and pictures of somebody with a joystick in a small house."""
     built = generate_house(house, rooms=rooms)
-    backend = HouseBackend([built], [0], robot=ROBOT, size=size)
+    simulator = HouseSimulator([built], [0], robot=ROBOT, size=size)
     cells = built.floor.centres()
     start = cells[np.argmin(np.hypot(*(cells - built.goals[0].pose[:2]).T))]
-    backend.place(np.array([0]), np.array([[*start, 0.0, 0.0]]))
+    simulator.place(np.array([0]), np.array([[*start, 0.0, 0.0]]))
     person, poses, pictures = Joystick(built, *start), [], []
     for tick in range(int(seconds / TICK)):
-        backend.move(person.velocity(backend.poses[0])[None] * TICK)
+        simulator.move(person.velocity(simulator.poses[0])[None] * TICK)
         if tick % EVERY == 0:
-            poses.append(backend.poses[0, :3].copy())
-            pictures.append(backend.observe().rgb[0].copy())
+            poses.append(simulator.poses[0, :3].copy())
+            pictures.append(simulator.observe().rgb[0].copy())
     return np.array(poses), np.array(pictures)
 
 
@@ -108,7 +107,7 @@ def graph(driven):
 
 def test_a_drive_with_a_joystick_is_a_place(graph):
     """Nothing of it is cut off, robots can turn everywhere, and ways lead to all goals."""
-    assert len(graph.goals) >= 12 and graph.geodesic(*graph.goals[0].pose[:2]).maximum > 2
+    assert len(graph.goals) >= 12 and graph.distance_to(graph.goals[0]).maximum > 2
     assert graph.map.component.mean() > 0.99 and graph.world_version == WORLD_VERSION
     env = make_env(graph, ROBOT, 16, max_decisions=60)
     _, info = env.reset(seed=0)
@@ -205,9 +204,18 @@ def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, ca
     assert own != others
 
 
+@pytest.mark.slow
+def test_a_drive_is_a_scene_by_its_name(bag, tmp_path):
+    model, figures = write_checkpoint(tmp_path / 'model', size=SIZE), tmp_path / 'figures.json'
+    assert main(['evaluate', str(model), '--scene', f'bag:{bag}', '--episodes', '4',
+                 '--max-decisions', '5', '--no-controls', '--json', str(figures)]) == 0
+    assert list(json.loads(figures.read_text())['splits']['scenes']['scenes']) == [f'bag:{bag}']
+    assert main(['evaluate', str(model), '--scene', 'bag:/nowhere', '--episodes', '4']) == 2
+
+
 @pytest.mark.parametrize(('known', 'code', 'says'), [
     ({'world_version': '0'}, 2, 'world version'), ({'world_version': 'recorded'}, 0, ''),
-    ({'task': 'room'}, 2, 'its task is image'), ({'camera_fov_deg': 60.0}, 2, 'the camera')])
+    ({'task': 'room'}, 2, 'knows rooms'), ({'camera_fov_deg': 60.0}, 2, 'the camera')])
 def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, bag, tmp_path,
                                                            capsys):
     model = write_checkpoint(tmp_path / 'model', size=SIZE)

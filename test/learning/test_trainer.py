@@ -14,7 +14,8 @@ from vn_nav.learning.state_file import read_state
 from vn_nav.learning.trainer import train
 from vn_nav.learning.training import STATE
 from vn_nav.policy.checkpoint import load_checkpoint
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 FACTS = {'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
 QUICK = TrainConfig(frames=800, rollout_length=16, channels=(8, 8, 8), features=24, hidden=16,
@@ -29,7 +30,7 @@ def one_thread():
 
 def make_env(**options):
     return NavigationEnv(EnvConfig(**{
-        'houses': (3,), 'rooms': 1, 'num_envs': 8, 'size': 36, 'max_decisions': 40} | options))
+        'scenes': ('house:3?rooms=1',), 'num_envs': 8, 'size': 36, 'max_decisions': 40} | options))
 
 
 def weights_of(folder):

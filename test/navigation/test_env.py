@@ -7,7 +7,11 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.navigation.env import EnvConfig, HouseNavigation, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_nav.vector_env import MeasuredVectorEnv, NavigationVectorEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
+from vn_sim_bridge.navigation.gym_env import HouseNavigation
 from vn_sim_bridge.navigation.tasks import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_sim_bridge.render.randomisation import load_randomisation
 
@@ -15,7 +19,8 @@ STANDARD = load_randomisation('standard')
 
 
 def make(**options):
-    return NavigationEnv(EnvConfig(**{'houses': (7,), 'num_envs': 4, 'size': 36} | options))
+    return NavigationEnv(EnvConfig(**{
+        'scenes': ('house:7',), 'num_envs': 4, 'size': 36} | options))
 
 
 def random_actions(env, seed=0):
@@ -139,13 +144,21 @@ def test_observations_lie_in_their_space():
         observation, *_ = env.step(act())
 
 
+def test_it_is_what_trainer_and_evaluator_use():
+    env = make()
+    assert isinstance(env, MeasuredVectorEnv) and isinstance(env, NavigationVectorEnv)
+    _, info = env.reset(seed=0)
+    assert {'reset', 'success', 'collided', 'arrived', 'distance', 'heading_error',
+            'start_distance', 'path_length', 'decisions', 'goal', 'pose'} <= info.keys()
+
+
 def test_sixteen_environments_hold_sixteen_scene_goal_pairs():
-    env = make(houses=(1, 2, 3, 4), num_envs=16, rooms=4, one_goal_per_env=True)
+    env = make(scenes=house_scenes((1, 2, 3, 4), 4), num_envs=16, one_goal_per_env=True)
     observation, info = env.reset(seed=0)
     assert len(np.unique(info['goal'])) == 16
     pictures = env.goals[observation['goal_index']]
     assert len(np.unique(pictures.reshape(16, -1), axis=0)) == 16
-    assert len(np.unique(env.house_index[:4])) == 4
+    assert len(np.unique(env.place_index[:4])) == 4
 
 
 def test_results_do_not_depend_on_the_number_of_environments():
@@ -284,13 +297,15 @@ def test_privileged_outputs_stand_beside_the_pictures():
 def test_a_robot_that_sees_its_goal_pose_sees_the_goal_picture():
     env = make(size=84, num_envs=2)
     observation, info = env.reset(seed=0)
-    env.backend.place(np.arange(2), env.goal_poses[info['goal']])
-    seen = env.backend.observe().rgb
+    env.simulator.place(np.arange(2), env.goal_poses[info['goal']])
+    seen = env.simulator.observe().rgb
     assert np.array_equal(seen, env.goals[observation['goal_index']])
 
 
 @pytest.mark.parametrize('options', [
-    {'houses': ()}, {'num_envs': 0}, {'max_decisions': 0}, {'size': 4},
+    {'scenes': ()}, {'scenes': ('house:1', 'bag:1')}, {'scenes': ('7',)},
+    {'scenes': ('house:x',)}, {'scenes': ('house:1?doors=2',)}, {'num_envs': 0},
+    {'max_decisions': 0}, {'size': 4},
     {'privileged': ('pose',)}, {'actions': ('fly',)}, {'stop': 'never'},
     {'stop': 'declared', 'task': 'room'}, {'goal_variants': 0}, {'goal_seed': -1},
 ])
@@ -311,7 +326,7 @@ LABELS = ('goal_pose', 'overlap')
 
 
 def test_the_goal_pose_leads_to_the_goal():
-    env = make(houses=(7, 8), num_envs=8, privileged=LABELS, goal_variants=3)
+    env = make(scenes=house_scenes((7, 8)), num_envs=8, privileged=LABELS, goal_variants=3)
     observation, info = env.reset(seed=0)
     act = random_actions(env)
     for _ in range(30):
@@ -345,14 +360,14 @@ def test_overlap_belongs_to_the_true_goal_and_a_grey_picture_has_none():
 def test_a_robot_at_its_goal_sees_all_of_it_and_one_that_turns_away_nothing():
     env = make(num_envs=5, privileged=LABELS, stop='declared')
     _, info = env.reset(seed=0)
-    env.backend.place(np.arange(5), env.goal_poses[info['goal']])
+    env.simulator.place(np.arange(5), env.goal_poses[info['goal']])
     _, reward, terminated, _, info = env.step([env.declare_action] * 5)
     assert (info['overlap'] == 1).all() and np.allclose(info['goal_pose'], [0, 0, 1, 0], atol=1e-6)
     assert terminated.all() and info['success'].all() and (reward == 1).all()
     _, info = env.reset(seed=0)
     poses = env.goal_poses[info['goal']].copy()
     poses[:, 2] += np.pi
-    env.backend.place(np.arange(5), poses)
+    env.simulator.place(np.arange(5), poses)
     _, reward, terminated, _, info = env.step([env.declare_action] * 5)
     assert (info['overlap'] == 0).all() and terminated.all()
     assert not info['success'].any() and not info['arrived'].any() and (reward == 0).all()
@@ -415,7 +430,7 @@ def test_a_declaration_is_judged_where_the_robot_stands():
 
 
 def test_more_houses_than_environments_are_all_visited_and_resumed():
-    options = dict(houses=(1, 2, 3, 4, 5), rooms=2, num_envs=2, max_decisions=2, size=24,
+    options = dict(scenes=house_scenes((1, 2, 3, 4, 5), 2), num_envs=2, max_decisions=2, size=24,
                    privileged=LABELS)
     env, other = make(**options), make(**options)
     env.reset(seed=1)
@@ -424,11 +439,11 @@ def test_more_houses_than_environments_are_all_visited_and_resumed():
     for _ in range(90):
         _, _, _, _, info = env.step(act())
         for n in range(2):
-            house = int(env.house_index[n])
+            house = int(env.place_index[n])
             seen[n].add(house)
-            field = env.houses[house].geodesic(*env.goal_poses[info['goal'][n], :2])
+            field = env.places[house].geodesic(*env.goal_poses[info['goal'][n], :2])
             assert info['distance'][n] == pytest.approx(
-                field.distance(info['pose'][n:n + 1, :2])[0], abs=1e-5)
+                field.at(info['pose'][n:n + 1, :2])[0], abs=1e-5)
     assert seen == [{0, 2, 4}, {1, 3}]
     other.reset(seed=9)
     other.set_state(env.get_state())
@@ -438,7 +453,7 @@ def test_more_houses_than_environments_are_all_visited_and_resumed():
         for part in (0, 4):
             for name in one[part]:
                 assert np.array_equal(one[part][name], two[part][name]), name
-        assert np.array_equal(env.house_index, other.house_index)
+        assert np.array_equal(env.place_index, other.place_index)
 
 
 def test_new_floor_pays_and_is_never_shown():
@@ -449,7 +464,7 @@ def test_new_floor_pays_and_is_never_shown():
     other = make(exploration_reward=0.5, **options)
     act = random_actions(plain)
     squares = [set() for _ in range(8)]
-    origin = np.array(plain.houses[0].floor.origin)
+    origin = np.array(plain.places[0].floor.origin)
     total, reward, shaped = 0.0, np.zeros(8), np.zeros(8)
     for step in range(60):
         for n in range(8):
@@ -475,7 +490,7 @@ def test_new_floor_pays_and_is_never_shown():
 
 def test_other_goals_in_the_same_house():
     own, unseen, again = make(), make(goal_seed=1), make(goal_seed=1)
-    assert np.array_equal(own.houses[0].scene.vertices, unseen.houses[0].scene.vertices)
+    assert np.array_equal(own.places[0].scene.vertices, unseen.places[0].scene.vertices)
     assert own.goal_rooms == unseen.goal_rooms
     assert (own.goal_poses[:, :2] != unseen.goal_poses[:, :2]).any(axis=1).all()
     assert np.array_equal(unseen.goal_poses, again.goal_poses)

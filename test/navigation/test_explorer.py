@@ -11,7 +11,9 @@ from vn_nav.learning.batches import own_frames
 from vn_nav.learning.presets import preset
 from vn_nav.learning.rollout import Collector
 from vn_nav.policy.network import Policy
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.navigation.explorer import NEAR, SIDE, Explorer
 
 HOUSES = (10_000, 10_001, 10_002, 10_003)  # of the validation split
@@ -19,12 +21,12 @@ HOUSES = (10_000, 10_001, 10_002, 10_003)  # of the validation split
 
 def make_env(**options):
     return NavigationEnv(EnvConfig(**{
-        'houses': HOUSES, 'num_envs': 16, 'size': 36,
+        'scenes': house_scenes(HOUSES), 'num_envs': 16, 'size': 36,
         'privileged': ('explorer_action', 'overlap')} | options))
 
 
 def make_explorer(env):
-    return Explorer(env.houses, env.num_envs, fov=env.robot.camera_fov, turn=math.radians(30),
+    return Explorer(env.places, env.num_envs, fov=env.robot.camera_fov, turn=math.radians(30),
                     length=0.5, radius=0.6)
 
 
@@ -42,15 +44,16 @@ def test_it_arrives_in_houses_of_which_it_knows_nothing():
 
 
 def test_until_the_goal_was_seen_the_goal_changes_nothing():
-    env = make_env(houses=HOUSES[:1], num_envs=1)
+    env = make_env(scenes=house_scenes(HOUSES[:1]), num_envs=1)
     env.reset(seed=3)
     rng = np.random.default_rng(0)
     one, other = make_explorer(env), make_explorer(env)
-    shape = env._maps.shape
+    shape = env._distances.maps.shape
     for step in range(40):
-        poses, house = env.backend.poses, env.house_index
+        poses, house = env.simulator.poses, env.place_index
         common = {'turned': np.zeros(1)}
-        mine = one.turns(poses, house, np.zeros(1), np.array([5.0]), np.array([1.0]), env._maps,
+        mine = one.turns(poses, house, np.zeros(1), np.array([5.0]), np.array([1.0]),
+                         env._distances.maps,
                          **common)
         blind = other.turns(poses, house, np.zeros(1), np.array([0.1]), np.array([-2.0]),
                             rng.uniform(0, 9, shape).astype(np.float32), **common)
@@ -58,19 +61,19 @@ def test_until_the_goal_was_seen_the_goal_changes_nothing():
         env.step(rng.integers(0, 4, 1))
     assert not one.found[0]
     # Once it was seen, the way to it is what counts.
-    seen = one.turns(env.backend.poses, env.house_index, np.ones(1), np.array([0.1]),
-                     env.backend.poses[:, 2] + 1.0, env._maps, np.zeros(1))
+    seen = one.turns(env.simulator.poses, env.place_index, np.ones(1), np.array([0.1]),
+                     env.simulator.poses[:, 2] + 1.0, env._distances.maps, np.zeros(1))
     assert one.found[0] and seen[0] == pytest.approx(1.0)
 
 
 def test_it_sees_in_front_and_around_itself_but_not_through_walls():
-    env = make_env(houses=HOUSES[:1], num_envs=1)
+    env = make_env(scenes=house_scenes(HOUSES[:1]), num_envs=1)
     env.reset(seed=4)
     explorer = make_explorer(env)
-    explorer.turns(env.backend.poses, env.house_index, np.zeros(1), np.array([5.0]),
-                   np.array([0.0]), env._maps, np.zeros(1))
-    x, y, yaw, _ = env.backend.poses[0]
-    x, y = np.array([x, y]) - env.houses[0].floor.origin
+    explorer.turns(env.simulator.poses, env.place_index, np.zeros(1), np.array([5.0]),
+                   np.array([0.0]), env._distances.maps, np.zeros(1))
+    x, y, yaw, _ = env.simulator.poses[0]
+    x, y = np.array([x, y]) - env.places[0].floor.origin
     rows, columns = np.nonzero(explorer.seen[0])
     ahead = (np.array([columns, rows]).T + 0.5) * SIDE - (x, y)
     distance = np.hypot(*ahead.T)

@@ -4,17 +4,19 @@ import numpy as np
 import pytest
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.houses.house import DistanceField
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.houses.labels import LABEL
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS, object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.navigation import tasks
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 
 def make(task, **options):
-    return NavigationEnv(EnvConfig(**{'houses': (7, 3), 'num_envs': 8, 'size': 48, 'task': task}
-                                   | options))
+    return NavigationEnv(EnvConfig(**{
+        'scenes': ('house:7', 'house:3'), 'num_envs': 8, 'size': 48, 'task': task} | options))
 
 
 def oracle_ends(env, steps):
@@ -52,14 +54,14 @@ def test_a_room_is_seen_when_its_objects_fill_a_share_of_the_picture():
 def test_object_goal(objects):
     env = make('object', objects=objects)
     observation, info = env.reset(seed=0)
-    present = env.backend.object_models() >= 0
+    present = env.simulator.object_models() >= 0
     assert (present.sum(axis=1) == objects).all()
-    first = env.backend.objects.pose[:, 0, :2].copy()
+    first = env.simulator.objects.pose[:, 0, :2].copy()
     assert (info['start_distance'] >= 2.0 - 0.2).all()
     arrived, gave_up = oracle_ends(env, 200)
     assert arrived > 20 and gave_up == 0
     _, later = env.reset()
-    assert (np.hypot(*(env.backend.objects.pose[:, 0, :2] - first).T) > 0.1).mean() > 0.8
+    assert (np.hypot(*(env.simulator.objects.pose[:, 0, :2] - first).T) > 0.1).mean() > 0.8
     names = {env.goal_rooms[goal] for goal in [*info['goal'], *later['goal']]}
     assert names <= set(GOAL_OBJECTS) and len(names) > 1
 
@@ -74,10 +76,10 @@ def test_the_goal_picture_shows_the_object():
 def test_success_is_within_a_metre_of_the_object():
     env = make('object', num_envs=2, noise=False)
     env.reset(seed=3)
-    target = env.backend.objects.pose[:, 0]
-    poses = env.backend.poses.copy()
+    target = env.simulator.objects.pose[:, 0]
+    poses = env.simulator.poses.copy()
     poses[0, :2] = target[0, :2]
-    env.backend.place(np.arange(2), poses)
+    env.simulator.place(np.arange(2), poses)
     *_, terminated, _, info = env.step(np.array([2, 2]))
     assert terminated.tolist() == [True, False]
     assert info['distance'][0] < 0.3 and info['distance'][1] > 1.0
@@ -85,13 +87,13 @@ def test_success_is_within_a_metre_of_the_object():
 
 @pytest.mark.parametrize('must_see', [False, True])
 def test_room_goal(must_see):
-    env = make('room', rooms=8, room_must_see=must_see)
+    env = make('room', scenes=house_scenes((7, 3), 8), room_must_see=must_see)
     _, info = env.reset(seed=0)
     arrived, gave_up = oracle_ends(env, 150)
     assert arrived > 20 and gave_up == 0
     for n in range(8):
         goal = env._goal[n]
-        kinds = {room.kind for room in env.houses[env.house_index[n]].rooms
+        kinds = {room.kind for room in env.places[env.place_index[n]].rooms
                  if room.rect in env.task.inside[goal]}
         assert kinds == {env.task.kinds[goal]}
 
@@ -101,11 +103,11 @@ def test_any_room_of_the_type_will_do():
     kinds = [room.kind for room in house.rooms]
     twice = next(kind for kind in kinds if kinds.count(kind) > 1)
     rects = [room.rect for room in house.rooms if room.kind == twice]
-    field = DistanceField.to_rectangles(house.floor, rects)
-    single = [DistanceField.to_rectangles(house.floor, [rect]) for rect in rects]
+    field = FloorDistance.to_rectangles(house.floor, rects)
+    single = [FloorDistance.to_rectangles(house.floor, [rect]) for rect in rects]
     cells = house.floor.centres()
-    nearest = np.min([one.distance(cells) for one in single], axis=0)
-    assert np.allclose(field.distance(cells), nearest, atol=0.15)
+    nearest = np.min([one.at(cells) for one in single], axis=0)
+    assert np.allclose(field.at(cells), nearest, atol=0.15)
 
 
 def test_seeing_the_room_takes_two_decisions_in_a_row():
@@ -129,17 +131,17 @@ def test_collect_counts_apples_and_lemons():
     env = make('collect', num_envs=4, objects=10, max_decisions=30, noise=False)
     observation, _ = env.reset(seed=0)
     assert (observation['goal_index'] == env.blank_goal).all() and len(env.goals) == 1
-    models = env.backend.object_models()
+    models = env.simulator.object_models()
     assert ((models == 0).sum(axis=1) == 5).all() and ((models == 1).sum(axis=1) == 5).all()
     for model, value in ((0, 1.0), (1, -1.0)):
-        item = np.argmax(env.backend.object_models() == model, axis=1)
-        poses = env.backend.poses.copy()
-        poses[:, :2] = env.backend.objects.pose[np.arange(4), item, :2]
-        env.backend.place(np.arange(4), poses)
+        item = np.argmax(env.simulator.object_models() == model, axis=1)
+        poses = env.simulator.poses.copy()
+        poses[:, :2] = env.simulator.objects.pose[np.arange(4), item, :2]
+        env.simulator.place(np.arange(4), poses)
         observation, reward, terminated, _, _ = env.step(np.full(4, 2))
         assert np.allclose(reward, value) and not terminated.any()
         assert np.allclose(observation['last_reward'], value)
-        assert (env.backend.objects.scene[np.arange(4), item] == -1).all()
+        assert (env.simulator.objects.scene[np.arange(4), item] == -1).all()
     for _ in range(28):
         _, reward, terminated, truncated, _ = env.step(np.full(4, 2))
     assert truncated.all() and not terminated.any()
@@ -149,7 +151,7 @@ def test_collect_counts_apples_and_lemons():
 
 @pytest.mark.parametrize('task', ['object', 'room', 'collect'])
 def test_tasks_do_not_depend_on_the_number_of_environments_and_resume(task):
-    options = {'houses': (7,), 'objects': 3, 'max_decisions': 12}
+    options = {'scenes': ('house:7',), 'objects': 3, 'max_decisions': 12}
     small, large = make(task, num_envs=2, **options), make(task, num_envs=4, **options)
     one, _ = small.reset(seed=2)
     many, _ = large.reset(seed=2)
@@ -168,7 +170,7 @@ def test_tasks_do_not_depend_on_the_number_of_environments_and_resume(task):
 
 
 def test_wrong_pictures_show_another_object():
-    env = make('object', houses=(7,), num_envs=16)
+    env = make('object', scenes=('house:7',), num_envs=16)
     right, info = env.reset(seed=0)
     env.set_shown_goal('wrong')
     wrong, other = env.reset(seed=0)

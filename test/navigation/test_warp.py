@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 
 from vn_nav.errors import UserError
+from vn_nav.scenes import house_scenes
+from vn_nav.vector_env import NavigationVectorEnv
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
-from vn_sim_bridge.render.pack import Lights, Objects
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
+from vn_sim_bridge.render.pack import Lights
 from vn_sim_bridge.render.randomisation import draw_appearance, load_randomisation
 from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.sensor import expose
+from vn_sim_bridge.simulator import Objects
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 COUNT = 60
@@ -70,7 +74,7 @@ def test_episodes_agree_with_the_environment(mode):
     from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     randomisation = dataclasses.replace(load_randomisation('rough'), late_picture=0.0)
     config = EnvConfig(
-        houses=(7, 3, 12_001), rooms=4, num_envs=24, size=48, max_decisions=20,
+        scenes=house_scenes((7, 3, 12_001), 4), num_envs=24, size=48, max_decisions=20,
         progress_reward=1.0, collision_reward=-0.1, randomisation=randomisation,
         actions=('forward', 'backward', 'rotate_left', 'rotate_right', 'left', 'look_up'))
     host, device = NavigationEnv(config), WarpNavigationEnv(config, device='cpu')
@@ -106,7 +110,9 @@ def test_observations_share_the_devices_memory():
     import torch
 
     from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
-    env = WarpNavigationEnv(EnvConfig(houses=(7,), rooms=1, num_envs=2, size=32), device='cpu')
+    env = WarpNavigationEnv(EnvConfig(scenes=('house:7?rooms=1',), num_envs=2, size=32),
+                            device='cpu')
+    assert isinstance(env, NavigationVectorEnv) and env.simulator_name == 'house'
     observation, _ = env.reset(seed=0)
     address = observation['image'].data_ptr()
     assert address == env.renderer.rgb.ptr
@@ -116,7 +122,7 @@ def test_observations_share_the_devices_memory():
         env.step(torch.zeros(3, dtype=torch.int64))
     for options in ({'task': 'room'}, {'randomisation': load_randomisation('rough')}):
         with pytest.raises(UserError):
-            WarpNavigationEnv(EnvConfig(houses=(7,), rooms=1, num_envs=2, **options),
+            WarpNavigationEnv(EnvConfig(scenes=('house:7?rooms=1',), num_envs=2, **options),
                               device='cpu')
 
 

@@ -25,7 +25,7 @@ FRAMES = Frames.with_prefix('')
 
 @pytest.fixture(scope='module')
 def robot():
-    robot = SimulatedRobot(7, 5, robot=RobotSpec(), noise=False, seed=5)
+    robot = SimulatedRobot('house:7', robot=RobotSpec(), noise=False, seed=5)
     robot.begin_episode(0)
     return robot
 
@@ -69,11 +69,11 @@ def test_depth_camera_info_and_frames_put_walls_where_they_are(robot):
     info = fill_camera_info(CameraInfo(), 84, 84, robot.robot.camera_fov)
     assert info.k[2] == info.k[5] == 41.5 and info.k[0] == pytest.approx(42.0)
     focal, cx, cy = info.k[0], info.k[2], info.k[5]
-    rects = robot.house.obstacle_rects
-    walls = rects[[o.label == 'wall' for o in robot.house.obstacles]]
+    rects = robot.place.obstacle_rects
+    walls = rects[[o.label == 'wall' for o in robot.place.obstacles]]
     gaps = []
     for yaw in np.arange(0, 2 * math.pi, 0.7):
-        robot.backend.place(np.array([0]), np.array([[*robot.pose[:2], yaw, 0.0]]))
+        robot.simulator.place(np.array([0]), np.array([[*robot.pose[:2], yaw, 0.0]]))
         seen = robot.observe()
         v, u = np.nonzero(seen.labels[0] == _label('wall'))
         z = seen.depth[0][v, u].astype(float)
@@ -102,7 +102,7 @@ def _outside(rects, x, y):
 
 
 def test_a_scan_ends_where_the_robot_would(robot):
-    scan = bridge_messages.fill_scan(LaserScan(), robot.house.obstacle_rects, robot.pose, 0.1)
+    scan = bridge_messages.fill_scan(LaserScan(), robot.place.obstacle_rects, robot.pose, 0.1)
     assert len(scan.ranges) == lidar.RAYS and scan.scan_time == pytest.approx(0.1)
     assert scan.angle_min + scan.angle_increment * (lidar.RAYS - 1) == pytest.approx(
         scan.angle_max)
@@ -112,9 +112,9 @@ def test_a_scan_ends_where_the_robot_would(robot):
     heading = robot.pose[2] + angles
     x = robot.pose[0] + ranges * np.cos(heading)
     y = robot.pose[1] + ranges * np.sin(heading)
-    assert np.abs(_outside(robot.house.obstacle_rects, x, y).min(axis=0)).max() < 1e-4
+    assert np.abs(_outside(robot.place.obstacle_rects, x, y).min(axis=0)).max() < 1e-4
     for part in (0.3, 0.7, 0.999):  # and nothing before that
-        ahead = _outside(robot.house.obstacle_rects,
+        ahead = _outside(robot.place.obstacle_rects,
                          robot.pose[0] + part * ranges * np.cos(heading),
                          robot.pose[1] + part * ranges * np.sin(heading))
         assert ahead.min() > 0
@@ -146,7 +146,7 @@ def test_frames_have_a_prefix_of_their_own_and_share_the_map(robot):
 
 
 def test_the_optical_frame_looks_ahead_and_down(robot):
-    robot.backend.place(np.array([0]), np.array([[*robot.pose[:2], 0.0, 0.5]]))
+    robot.simulator.place(np.array([0]), np.array([[*robot.pose[:2], 0.0, 0.5]]))
     transforms = tree(FRAMES, robot)
     in_base, _ = to_root('camera_optical_frame', {k: transforms[k] for k in (
         'camera_optical_frame', 'camera_link')})

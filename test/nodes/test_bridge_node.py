@@ -34,7 +34,8 @@ from vn_nav.resources import share_file
 from vn_nav.robot import AXES, Action, RobotSpec, load_robot
 from vn_sim_bridge.bridge_messages import odom_in_map
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.navigation.tasks import wrap_angle
 from vn_sim_bridge.robot.goal_pictures import GoalPicture, save_goal_pictures
 from vn_sim_bridge.robot.simulated_robot import TERMINATED, TICK, SimulatedRobot
@@ -423,7 +424,7 @@ def journey():
     Displacements of the first robot's decisions; whether it could have declared after each; and
     the decisions of both episodes, the declaration included.
     """
-    env = NavigationEnv(EnvConfig(houses=(7,), num_envs=2, noise=False, stop='declared'))
+    env = NavigationEnv(EnvConfig(scenes=('house:7',), num_envs=2, noise=False, stop='declared'))
     _, info = env.reset(seed=5)
     deltas, arrived = [], []
     while True:
@@ -441,7 +442,7 @@ def journey():
 
 def test_a_declared_stop_is_judged_as_navigation_env_judges_it(journey):
     deltas, arrived, decisions, false_stop = journey
-    robot = SimulatedRobot(7, 5, robot=RobotSpec(), noise=False, seed=5, stop='declared')
+    robot = SimulatedRobot('house:7', robot=RobotSpec(), noise=False, seed=5, stop='declared')
     episode = robot.begin_episode(0)
     for delta in deltas:
         assert robot.tick(delta / TICK) is None
@@ -522,19 +523,20 @@ def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
                for record in read_bag(tmp_path / 'bag', ('action',))]
     begins = [record.stamp for record in read_bag(tmp_path / 'bag', ('episode',))]
     assert len(drive.episodes) == sequences
-    env = NavigationEnv(EnvConfig(houses=(7,), num_envs=1, noise=False, max_decisions=1000))
+    env = NavigationEnv(EnvConfig(scenes=('house:7',), num_envs=1, noise=False,
+                                  max_decisions=1000))
     env.reset(seed=0)
     distances, turns = [], []
     for k, recorded in enumerate(drive.episodes):
         end = begins[k + 1] if k + 1 < len(begins) else np.inf
         chosen = [action for stamp, action in actions if begins[k] <= stamp < end]
         assert len(chosen) == recorded.episode.decisions
-        env.backend.place(np.array([0]), np.array([recorded.facts['start']]))
+        env.simulator.place(np.array([0]), np.array([recorded.facts['start']]))
         for action in chosen:
-            env.backend.move(env._deltas[[action]])
+            env.simulator.move(env._deltas[[action]])
         x, y, yaw = recorded.trajectory[-1]
-        distances.append(np.hypot(*(env.backend.poses[0, :2] - (x, y))))
-        turns.append(abs(np.degrees(wrap_angle(env.backend.poses[0, 2] - yaw))))
+        distances.append(np.hypot(*(env.simulator.poses[0, :2] - (x, y))))
+        turns.append(abs(np.degrees(wrap_angle(env.simulator.poses[0, 2] - yaw))))
     assert max(distances) < 0.02 and max(turns) < 2.0, (max(distances), max(turns))
     print(f'largest difference {max(distances) * 1000:.2f} mm, {max(turns):.4f} deg')
 
@@ -546,7 +548,8 @@ import numba.core.dispatcher as dispatcher, numpy as np
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
-robot = SimulatedRobot(7, 2, robot=RobotSpec(), size=40, randomisation=load_randomisation('rough'))
+robot = SimulatedRobot('house:7?rooms=2', robot=RobotSpec(), size=40,
+                       randomisation=load_randomisation('rough'))
 robot.begin_episode(0)
 robot.goal_frames()
 def compile(self, signature):

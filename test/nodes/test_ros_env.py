@@ -37,8 +37,10 @@ from vn_nav.nodes.ros_env import RosEnv
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
-from vn_sim_bridge.floor.contacts import WORLD_VERSION
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.vector_env import NavigationVectorEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
+from vn_sim_bridge.simulators.house import WORLD_VERSION
 
 pytestmark = pytest.mark.ros
 BASE = share_file('config/robots/demo_base.yaml')
@@ -180,10 +182,12 @@ def test_it_shows_what_the_simulator_itself_would_show(tmp_path):
 
     Of an episode's end the bridge shows no picture: the one before stands in.
     """
-    inner = NavigationEnv(EnvConfig(houses=(7,), rooms=1, num_envs=1, size=36, noise=False,
+    inner = NavigationEnv(EnvConfig(scenes=('house:7?rooms=1',), num_envs=1, size=36, noise=False,
                                     max_decisions=6, seed=3), load_robot(BASE))
     with bridge(tmp_path, noise=False), RosEnv(ROBOT, 36, lock_step=True) as env:
         assert env.num_envs == 1 and env.action_names == inner.action_names
+        assert isinstance(env, NavigationVectorEnv) and env.simulator_name == 'house'
+        assert env.scene_names == ['house:7?rooms=1'] and not env.restorable
         assert env.world_version == inner.world_version
         assert set(env.offers) == {'depth', 'segmentation'}
         env.listen(('depth', 'segmentation'))

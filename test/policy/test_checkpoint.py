@@ -124,6 +124,7 @@ def test_the_shipped_models_and_those_from_before_the_checksum_load(tmp_path):
     (lambda c: c.update(action_names=5), 'action_names'),
     (lambda c: c.update(houses='7'), 'houses'),
     (lambda c: c.update(houses=[1.5]), 'houses'),
+    (lambda c: c.update(scenes=[7]), 'scenes'), (lambda c: c.update(scenes='house:7'), 'scenes'),
     (lambda c: c.update(frames='many'), 'frames'),
     (lambda c: c.update(camera_fov_deg=10**400), 'camera_fov_deg'),
     (lambda c: c.update(stop_threshold=[]), 'stop_threshold'),

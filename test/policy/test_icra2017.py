@@ -23,8 +23,10 @@ from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.zhu import RandomFeatures, scene_numbers
 from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import DRIVE_ACTIONS
+from vn_nav.scenes import house_scenes
 from vn_sim_bridge.navigation import tasks
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 ZHU = NetworkConfig(actions=DRIVE_ACTIONS, size=36, architecture='icra2017', hidden=24, frames=4)
 SCENES = dataclasses.replace(ZHU, scenes=3)
@@ -301,17 +303,17 @@ def test_a_scene_teaches_its_own_layers_alone():
 
 
 def test_rollouts_know_the_house_of_every_row():
-    env = NavigationEnv(EnvConfig(houses=(1, 2, 3), rooms=1, num_envs=2, size=36, seed=5,
+    env = NavigationEnv(EnvConfig(scenes=house_scenes((1, 2, 3), 1), num_envs=2, size=36, seed=5,
                                   max_decisions=3))
     network = build_policy(SCENES)
     collector = Collector(env, network, torch.Generator().manual_seed(0))
     collector.begin(0)
-    homes = [env.house_index.copy()]
+    homes = [env.place_index.copy()]
     step = env.step
 
     def noting(actions):
         result = step(actions)
-        homes.append(env.house_index.copy())
+        homes.append(env.place_index.copy())
         return result
     env.step = noting
     rollout, _ = collector.collect(24)
@@ -323,7 +325,7 @@ def test_rollouts_know_the_house_of_every_row():
 
 
 def test_more_houses_than_scenes_are_refused():
-    env = NavigationEnv(EnvConfig(houses=(1, 2, 3), rooms=1, num_envs=3, size=36))
+    env = NavigationEnv(EnvConfig(scenes=house_scenes((1, 2, 3), 1), num_envs=3, size=36))
     collector = Collector(env, build_policy(dataclasses.replace(ZHU, scenes=2)), torch.Generator())
     collector.begin(0)
     with pytest.raises(UserError, match='scene 2'):
@@ -340,9 +342,10 @@ def test_unknown_scenes_are_refused():
         policy.act(observation, env.goals, info['reset'], np.array([0, 3, 1]))
     with pytest.raises(UserError, match='is told the scene'):
         policy.act(observation, env.goals, info['reset'])
-    assert scene_numbers([8, 7, 8], [7, 8]).tolist() == [1, 0, 1]
-    with pytest.raises(UserError, match='house 9'):
-        scene_numbers([8, 9], [7, 8])
+    known = ['house:7', 'house:8']
+    assert scene_numbers(['house:8', 'house:7', 'house:8'], known).tolist() == [1, 0, 1]
+    with pytest.raises(UserError, match='house:9'):
+        scene_numbers(['house:8', 'house:9'], known)
 
 
 def test_scenes_change_what_a_policy_does():
@@ -401,7 +404,7 @@ def test_the_network_never_sees_them():
     for kind, terms in (('plain', {}), ('zhu', ENVIRONMENT['icra2017'])):
         terms = {name: value for name, value in terms.items() if name.endswith(
             ('_reward', '_bonus'))}
-        env = NavigationEnv(EnvConfig(houses=(7,), rooms=2, num_envs=8, size=36, **terms))
+        env = NavigationEnv(EnvConfig(scenes=('house:7?rooms=2',), num_envs=8, size=36, **terms))
         observations, rewards = [env.reset(seed=3)[0]], []
         for _ in range(60):
             observation, reward, *_, info = env.step(env.oracle_actions())

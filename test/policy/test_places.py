@@ -22,7 +22,7 @@ from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.datasets.recorded_views import GraphViews
 from vn_sim_bridge.recorded.pose_lattice import MOST
 from vn_sim_bridge.recorded.relight import draw_light, relight
-from vn_sim_bridge.simulators.recorded import ImageGraphBackend
+from vn_sim_bridge.simulators.recorded import RecordedSimulator
 from vn_sim_bridge.teach_place import make_views, regrets
 
 SIDE = 36
@@ -208,17 +208,17 @@ def test_light_is_a_function_of_the_counter_and_changes_every_pixel_alike():
 
 def test_every_episode_in_a_graph_has_a_light_and_goals_have_none(corridor):
     robots = np.arange(2)
-    lit = ImageGraphBackend(corridor, 2, robot=ROBOT, light=True, draw=False)
-    plain = ImageGraphBackend(corridor, 2, robot=ROBOT, draw=False)
+    lit = RecordedSimulator(corridor, 2, robot=ROBOT, light=True, draw=False)
+    plain = RecordedSimulator(corridor, 2, robot=ROBOT, draw=False)
     poses = np.array([[*corridor.poses[k], 0.0] for k in (5, 9)])
-    for backend in (lit, plain):
-        backend.place(robots, poses)
+    for simulator in (lit, plain):
+        simulator.place(robots, poses)
     assert np.array_equal(lit.observe().rgb, plain.observe().rgb)  # nothing drawn yet
-    lit.dress(robots, 0, Stream.APPEARANCE, robots, np.array([4, 4]))
+    lit.apply_appearance(robots, 0, Stream.APPEARANCE, robots, np.array([4, 4]))
     first, true = lit.observe().rgb, plain.observe().rgb
     assert not np.array_equal(first, true)
     assert np.array_equal(first[1], lit.observe(np.array([1])).rgb[0])
-    lit.dress(np.array([1]), 0, Stream.APPEARANCE, np.array([1]), np.array([5]))
+    lit.apply_appearance(np.array([1]), 0, Stream.APPEARANCE, np.array([1]), np.array([5]))
     second = lit.observe().rgb
     assert np.array_equal(first[0], second[0]) and not np.array_equal(first[1], second[1])
     goals = np.array([[*corridor.goals[0].pose]])

@@ -11,14 +11,15 @@ from vn_nav.bags.storage.reader import read_bag
 from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 
 pytestmark = pytest.mark.ros
 
 
 @pytest.mark.parametrize('camera', [84, 174])
 def test_simulator_live_and_bag_agree(tmp_path, camera):
-    env = NavigationEnv(EnvConfig(houses=(7,), num_envs=3, size=camera))
+    env = NavigationEnv(EnvConfig(scenes=('house:7',), num_envs=3, size=camera))
     pictures = env.reset(seed=0)[0]['image']
     with BagWriter(tmp_path / 'bag', [topic('image_raw')]) as bag:
         live = []

@@ -17,7 +17,9 @@ import torch
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime
 from vn_nav.resources import share_file
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.randomisation import load_randomisation
 
 RECORD = Path(__file__).with_name('shipped_actions.json')
@@ -29,7 +31,7 @@ ALONE = 80  # decisions of one robot
 def make_env(model: str, info: dict, size: int) -> NavigationEnv:
     """Episodes of at most `LIMIT` decisions, with the randomisation of the model's training."""
     return NavigationEnv(EnvConfig(
-        houses=HOUSES[model], rooms=info['rooms'], num_envs=ENVIRONMENTS, size=size,
+        scenes=house_scenes(HOUSES[model]), num_envs=ENVIRONMENTS, size=size,
         max_decisions=LIMIT, randomisation=load_randomisation(info['randomisation'])))
 
 

@@ -11,13 +11,15 @@ from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.datasets.recorded_pairs import GraphPairs
-from vn_sim_bridge.houses.house import CELL
+from vn_sim_bridge.floor.distance import FloorDistance
+from vn_sim_bridge.floor.floor_map import CELL
 from vn_sim_bridge.houses.procedural import generate_house
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.recorded.image_graph import KEPT, build_graph
 from vn_sim_bridge.recorded.pose_lattice import GAP, HEADING, TURNED_MOST, _components
-from vn_sim_bridge.simulators.house import HouseBackend
-from vn_sim_bridge.simulators.recorded import ImageGraphBackend, turned
+from vn_sim_bridge.simulators.house import HouseSimulator
+from vn_sim_bridge.simulators.recorded import RecordedSimulator, turned
 from vn_sim_bridge.teach_place import held_out, make_env, make_pairs
 
 SLACK = CELL + HEADING
@@ -28,8 +30,8 @@ def corridor():
     return corridor_graph()
 
 
-def backend(graph, *poses, **options):
-    made = ImageGraphBackend(graph, len(poses), robot=ROBOT, **options)
+def simulator(graph, *poses, **options):
+    made = RecordedSimulator(graph, len(poses), robot=ROBOT, **options)
     made.place(np.arange(len(poses)), np.array([[*pose, 0.0] for pose in poses], float))
     return made
 
@@ -38,18 +40,19 @@ def test_the_floor_is_what_lies_beside_the_way(corridor):
     cells = corridor.floor.centres()
     aside = np.hypot(np.maximum(np.maximum(-cells[:, 0], cells[:, 0] - 4), 0), cells[:, 1])
     assert aside.max() <= 0.3 and len(cells) * CELL**2 > 0.9 * (4 * 0.6 + math.pi * 0.3**2)
-    assert corridor.geodesic(0, 0).distance(np.array([[4.0, 0.0]]))[0] == pytest.approx(4, abs=0.1)
+    way = FloorDistance(corridor.floor, 0, 0).at(np.array([[4.0, 0.0]]))
+    assert way[0] == pytest.approx(4, abs=0.1)
     wide = graph_of(line(4), spin(4, 0), spin(0, 0), margin=0.6)
     assert wide.floor.free.sum() > 1.8 * corridor.floor.free.sum()
 
 
 def test_a_robot_sees_the_picture_taken_nearest_to_its_pose(corridor):
-    made = backend(corridor, *corridor.poses[[3, 40, 77]], draw=False)
+    made = simulator(corridor, *corridor.poses[[3, 40, 77]], draw=False)
     assert np.array_equal(made.observe().rgb, corridor.pictures[[3, 40, 77]])
     rng = np.random.default_rng(0)
     poses = np.column_stack([rng.uniform(0, 4, 60), rng.uniform(-0.2, 0.2, 60),
                              rng.uniform(-math.pi, math.pi, 60)])
-    made = backend(corridor, *poses, draw=False)
+    made = simulator(corridor, *poses, draw=False)
     made.observe()
     gap = np.hypot(*(poses[:, None, :2] - corridor.poses[None, :, :2]).transpose(2, 0, 1))
     turn = np.abs(wrap_angle(poses[:, None, 2] - corridor.poses[None, :, 2]))
@@ -62,7 +65,7 @@ def test_a_robot_sees_the_picture_taken_nearest_to_its_pose(corridor):
 
 
 def test_which_of_the_near_pictures_is_shown_is_drawn_by_the_key(corridor):
-    made = backend(corridor, *[(1.05, 0.02, 0.05)] * 64)
+    made = simulator(corridor, *[(1.05, 0.02, 0.05)] * 64)
     keys = np.arange(64).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     first = made.observe(keys=keys).rgb
     assert np.array_equal(first, made.observe(keys=keys).rgb)
@@ -70,7 +73,7 @@ def test_which_of_the_near_pictures_is_shown_is_drawn_by_the_key(corridor):
     assert np.array_equal(made.observe(some, keys[some]).rgb, first[some])
     assert len(np.unique(first.reshape(64, -1), axis=0)) >= 3
     assert np.ptp(made.seen_from[:, 0]) <= 0.5  # near ones
-    still = backend(corridor, *[(1.05, 0.02, 0.05)] * 64, draw=False)
+    still = simulator(corridor, *[(1.05, 0.02, 0.05)] * 64, draw=False)
     assert len(np.unique(still.observe(keys=keys).rgb.reshape(64, -1), axis=0)) == 1
 
 
@@ -78,7 +81,7 @@ def test_which_of_the_near_pictures_is_shown_is_drawn_by_the_key(corridor):
 def test_a_picture_is_turned_as_the_camera_would_have_been(pitch):
     robot = dataclasses.replace(ROBOT, camera_pitch=math.radians(pitch))
     house = generate_house(7, rooms=2)
-    drawn = HouseBackend([house], [0], robot=robot, size=64)
+    drawn = HouseSimulator([house], [0], robot=robot, size=64)
     poses = np.array([goal.pose for goal in house.goals])
     where = np.zeros(len(poses), int)
     before = drawn.view(where, poses).rgb.copy()
@@ -96,7 +99,7 @@ def test_a_picture_is_turned_as_the_camera_would_have_been(pitch):
 
 def test_where_nobody_looked_a_robot_cannot_turn():
     graph = graph_of(line(4), goals=5)  # one way, and never turned
-    made = backend(graph, (2.0, 0.0, 0.0))
+    made = simulator(graph, (2.0, 0.0, 0.0))
     most = math.radians(30)
     motion = made.move(np.array([[0, 0, 2 * most, 0]]))
     assert motion.collided[0]
@@ -112,12 +115,12 @@ def test_where_nobody_looked_a_robot_cannot_turn():
     # A small gap between two headings is none: a robot would be trapped there.
     parts = [line(4), *[line(4, x=0) + [0, 0, math.radians(a)] for a in (
         60 + GAP * math.degrees(HEADING) - 1,)]]
-    made = backend(graph_of(*parts, goals=5), (2.0, 0.0, 0.0))
+    made = simulator(graph_of(*parts, goals=5), (2.0, 0.0, 0.0))
     assert not made.move(np.array([[0, 0, math.radians(80), 0]])).collided[0]
 
 
 def test_a_move_that_leaves_the_floor_slides_along_it_or_ends(corridor):
-    made = backend(corridor, (1.0, 0.0, math.radians(30)), (1.0, 0.0, math.pi / 2))
+    made = simulator(corridor, (1.0, 0.0, math.radians(30)), (1.0, 0.0, math.pi / 2))
     motion = made.move(np.array([[1.0, 0, 0, 0], [1.0, 0, 0, 0]]))
     assert motion.collided.tolist() == [False, True]
     assert 1.6 < made.poses[0, 0] < 2.0 and 0.2 < made.poses[0, 1] <= 0.3 + CELL
@@ -130,9 +133,9 @@ def test_a_move_that_leaves_the_floor_slides_along_it_or_ends(corridor):
 
 def test_reached_points_are_those_of_moves(corridor):
     headings = np.linspace(-math.pi, math.pi, 9)[:-1]
-    ends = backend(corridor, (2.0, 0.1, 0.3)).reach(0, headings, 0.5)
+    ends = simulator(corridor, (2.0, 0.1, 0.3)).reach(0, headings, 0.5)
     for heading, end in zip(headings, ends, strict=True):
-        made = backend(corridor, (2.0, 0.1, heading))
+        made = simulator(corridor, (2.0, 0.1, heading))
         made.move(np.array([[0.5, 0, 0, 0]]))
         assert np.allclose(made.poses[0, :2], end)
 
@@ -142,7 +145,7 @@ def test_what_cannot_be_driven_to_and_back_is_left_out():
     poses = [spin(0, 0), line(4), spin(4, 0), line(4, math.pi, x=4)]
     episode = np.concatenate([np.zeros(sum(map(len, poses)), int), np.ones(len(far), int)])
     graph = graph_of(*poses, far, episode=episode)
-    assert (np.abs(graph.poses[:, 1]) < 1).all() and graph.geodesic(0, 0).maximum < 6
+    assert (np.abs(graph.poses[:, 1]) < 1).all() and FloorDistance(graph.floor, 0, 0).maximum < 6
     words = ' '.join(graph.words)
     assert f'{len(far)} are left out' in words
     assert all(abs(goal.pose[1]) < 1 for goal in graph.goals)
@@ -284,14 +287,14 @@ def test_labels_belong_to_the_picture_that_is_shown(corridor):
     known = 0
     for _ in range(30):
         x, y, c, s = info['goal_pose'].T
-        seen_from, goal = env.backend.seen_from, env.goal_poses[info['goal']]
+        seen_from, goal = env.simulator.seen_from, env.goal_poses[info['goal']]
         assert np.allclose(np.hypot(x, y), np.hypot(*(goal - seen_from)[:, :2].T), atol=1e-5)
         assert np.allclose(np.abs(np.arctan2(s, c)), info['heading_error'], atol=1e-5)
         assert set(np.unique(info['overlap'])) <= {-1.0, 0.0, 1.0}
         known += (info['overlap'] >= 0).sum()
         _, _, _, _, info = env.step(rng.integers(0, 4, 16))
     assert known > 40
-    env.backend.place(np.arange(16), env.goal_poses[info['goal']])
+    env.simulator.place(np.arange(16), env.goal_poses[info['goal']])
     env.set_shown_goal('blank')
     _, info = env.reset(seed=0)
     assert (info['overlap'] == 0).all()
@@ -301,7 +304,7 @@ def test_depth_of_the_bag_measures_the_overlap():
     house = generate_house(7, rooms=1)
     x, y = house.floor.centres()[house.floor.free.sum() // 2]
     poses = np.concatenate([spin(x, y), [[x, y, 0]]])
-    drawn = HouseBackend([house], [0], robot=ROBOT, size=32).view(
+    drawn = HouseSimulator([house], [0], robot=ROBOT, size=32).view(
         np.zeros(len(poses), int), np.column_stack([poses, np.zeros(len(poses))]))
     stored = np.clip(drawn.depth * 25.5, 1, 255).astype(np.uint8)
     poses = np.concatenate([poses, poses + [0, 3, 0], line(3, math.pi / 2, x=x, y=y)])
@@ -310,19 +313,19 @@ def test_depth_of_the_bag_measures_the_overlap():
                     for part in (drawn.rgb, stored))
     graph = build_graph(shown, poses, np.zeros(len(poses), int), ROBOT, depth=depth, goals=8,
                         world_version='2')
-    made = ImageGraphBackend(graph, 2, robot=ROBOT)
+    made = RecordedSimulator(graph, 2, robot=ROBOT)
     assert made.capabilities.depth
     env = NavigationEnv(EnvConfig(num_envs=2, size=32, privileged=('overlap', 'depth')), ROBOT,
-                        backend=made)
+                        simulator=made)
     _, info = env.reset(seed=0)
     assert info['depth'].dtype == np.float32
-    env.backend.place(np.arange(2), env.goal_poses[info['goal']])
-    env.backend._draw = False
-    assert (env._overlap(env.backend.observe().depth) > 0.95).all()
+    env.simulator.place(np.arange(2), env.goal_poses[info['goal']])
+    env.simulator._draw = False
+    assert (env._overlap(env.simulator.observe().depth) > 0.95).all()
     away = env.goal_poses[info['goal']].copy()
     away[:, 2] = wrap_angle(away[:, 2] + math.pi)
-    env.backend.place(np.arange(2), away)
-    assert (env._overlap(env.backend.observe().depth) < 0.1).all()
+    env.simulator.place(np.arange(2), away)
+    assert (env._overlap(env.simulator.observe().depth) < 0.1).all()
 
 
 @pytest.mark.parametrize('options', [
@@ -333,12 +336,12 @@ def test_depth_of_the_bag_measures_the_overlap():
 def test_what_pictures_cannot_do_is_refused(corridor, options):
     with pytest.raises(UserError, match='correct the environment'):
         NavigationEnv(EnvConfig(**{'num_envs': 2, 'size': SIZE} | options),
-                      backend=ImageGraphBackend(corridor, 2, robot=ROBOT))
+                      simulator=RecordedSimulator(corridor, 2, robot=ROBOT))
 
 
-def test_an_environment_takes_a_backend_instead_of_houses():
-    config = EnvConfig(houses=(7,), rooms=2, num_envs=2, size=24)
-    given = NavigationEnv(config, backend=HouseBackend(
+def test_an_environment_takes_a_simulator_instead_of_houses():
+    config = EnvConfig(scenes=('house:7?rooms=2',), num_envs=2, size=24)
+    given = NavigationEnv(config, simulator=HouseSimulator(
         [generate_house(7, rooms=2)], [0, 0], robot=RobotSpec(), size=24))
     plain = NavigationEnv(config)
     one, two = plain.reset(seed=1), given.reset(seed=1)
@@ -350,7 +353,7 @@ def test_an_environment_takes_a_backend_instead_of_houses():
 
 
 def test_a_floor_plan_covers_the_place(corridor):
-    plan = corridor.floor_plan()
+    plan = corridor.plan()
     outside = sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in plan['outside'])
     x0, y0, x1, y1 = plan['bounds']
     assert outside + plan['area'] == pytest.approx((x1 - x0) * (y1 - y0))

@@ -8,7 +8,8 @@ import pytest
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.randomisation import (
     Randomisation,
     blackbody,
@@ -20,7 +21,7 @@ from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
 
 
 def make(randomisation, **options):
-    return NavigationEnv(EnvConfig(**{'houses': (7,), 'num_envs': 6, 'size': 48,
+    return NavigationEnv(EnvConfig(**{'scenes': ('house:7',), 'num_envs': 6, 'size': 48,
                                       'randomisation': randomisation} | options))
 
 
@@ -60,8 +61,8 @@ def test_warm_light_is_red_and_cold_light_blue():
 def test_goal_and_observation_are_lit_independently():
     env = make(load_randomisation('standard'))
     observation, info = env.reset(seed=1)
-    env.backend.place(np.arange(6), env.goal_poses[info['goal']])
-    seen = env.backend.observe().rgb.astype(int)
+    env.simulator.place(np.arange(6), env.goal_poses[info['goal']])
+    seen = env.simulator.observe().rgb.astype(int)
     shown = env.goals[observation['goal_index']].astype(int)
     assert (np.abs(seen - shown).mean(axis=(1, 2, 3)) > 3).all()
     pictures = env.goals[:8].reshape(8, -1)  # one goal
@@ -92,8 +93,8 @@ def test_light_changes_with_the_episode_and_not_within_it():
     assert np.allclose(info['pose'], pose) and truncated.all()
     assert np.array_equal(first['image'], back['image'])
     env.step(np.zeros(6, int))  # new episodes
-    env.backend.place(np.arange(6), pose)
-    assert (env.backend.observe().rgb != first['image']).any(axis=(1, 2, 3)).all()
+    env.simulator.place(np.arange(6), pose)
+    assert (env.simulator.observe().rgb != first['image']).any(axis=(1, 2, 3)).all()
 
 
 def test_sensor_noise_has_the_promised_size_and_differs_from_frame_to_frame():
@@ -142,7 +143,7 @@ def test_the_bridge_shows_what_the_environment_shows():
     config = dataclasses.replace(load_randomisation('standard'), noise=(0, 0), blur=(0, 0))
     env = make(config, num_envs=3, seed=5)
     observation, info = env.reset(seed=5)
-    robot = SimulatedRobot(7, 5, robot=RobotSpec(), size=48, seed=5, randomisation=config)
+    robot = SimulatedRobot('house:7', robot=RobotSpec(), size=48, seed=5, randomisation=config)
     for n in range(3):
         robot.begin_episode(n)
         assert np.allclose(robot.pose, info['pose'][n])

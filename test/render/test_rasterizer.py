@@ -11,9 +11,9 @@ from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
-from vn_sim_bridge.render.pack import Objects
 from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.scene import SceneBuilder
+from vn_sim_bridge.simulator import Objects
 
 FOV = math.radians(90)
 

@@ -32,10 +32,10 @@ def test_what_is_none_is_refused(tmp_path, index):
 
 
 def test_episodes_go_to_these_poses_and_not_into_walls():
-    house = SimulatedRobot(7, 2, robot=RobotSpec(), size=16).house
+    house = SimulatedRobot('house:7?rooms=2', robot=RobotSpec(), size=16).place
     cells = house.floor.centres()
     poses = [(*cells[0], 0.5), (*cells[-1], 1.0)]
-    robot = SimulatedRobot(7, 2, robot=RobotSpec(), size=16, goal_poses=poses)
+    robot = SimulatedRobot('house:7?rooms=2', robot=RobotSpec(), size=16, goal_poses=poses)
     seen = set()
     for index in range(12):
         episode = robot.begin_episode(index)
@@ -45,5 +45,6 @@ def test_episodes_go_to_these_poses_and_not_into_walls():
         seen.add(episode.goal)
     assert seen == {0, 1}
     with pytest.raises(UserError, match='can stand'):
-        SimulatedRobot(7, 2, robot=RobotSpec(), size=16, goal_poses=[(-50.0, 0.0, 0.0)])
+        SimulatedRobot('house:7?rooms=2', robot=RobotSpec(), size=16,
+                       goal_poses=[(-50.0, 0.0, 0.0)])
     assert json.dumps(robot.goal.pose)  # as the bridge says it

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from vn_nav.robot import RobotSpec
-from vn_sim_bridge.houses.house import clearance
+from vn_nav.scenes import house_scene
+from vn_sim_bridge.floor.floor_map import clearance
 from vn_sim_bridge.navigation.tasks import wrap_angle
 from vn_sim_bridge.robot.joystick import (
     ANGULAR_RAMP,
@@ -24,8 +25,9 @@ HOUSE, ROOMS = 12_000, 5  # of the unseen look
 
 
 def robot_at_its_start(house=HOUSE, rooms=ROOMS):
-    robot = SimulatedRobot(house, rooms, robot=RobotSpec(), size=16, noise=False, seed=1,
-                           stop='declared', max_decisions=10**9, odometry_drift=1.0)
+    robot = SimulatedRobot(house_scene(house, rooms), robot=RobotSpec(), size=16,
+                           noise=False, seed=1, stop='declared', max_decisions=10**9,
+                           odometry_drift=1.0)
     robot.begin_episode(0)
     return robot
 
@@ -43,7 +45,7 @@ def drive(robot, joystick, seconds):
 @pytest.fixture(scope='module')
 def shown():
     robot = robot_at_its_start()
-    joystick = Joystick(robot.house, *robot.pose[:2])
+    joystick = Joystick(robot.place, *robot.pose[:2])
     return robot, joystick, *drive(robot, joystick, 90)
 
 
@@ -70,7 +72,7 @@ def test_it_turns_around_at_every_place(shown):
 
 @pytest.fixture(scope='module')
 def covering():
-    house = robot_at_its_start().house
+    house = robot_at_its_start().place
     gap = clearance(house.floor.origin, house.floor.free.shape, house.obstacle_rects)
     return house, gap - house.footprint_radius
 
@@ -81,7 +83,7 @@ def test_the_places_cover_the_floor(covering):
     counts = []
     for spacing in (1.0, 2.0):
         places, fields = cover(house, gap, spacing)
-        near = np.min([field.distance(cells) for field in fields], axis=0)
+        near = np.min([field.at(cells) for field in fields], axis=0)
         assert (near <= 0.8 * spacing).mean() > 0.85
         assert {house.room_at(*place) for place in places} >= {r.name for r in house.rooms}
         counts.append(len(places))
@@ -94,7 +96,7 @@ def test_the_tour_goes_through_a_room_at_a_time(covering):
     places, fields = cover(house, gap, 1.0)
     order = tour(places, fields, places[0])
     assert sorted(order) == list(range(len(places)))
-    between = np.array([field.distance(places) for field in fields])
+    between = np.array([field.at(places) for field in fields])
     assert between[order[:-1], order[1:]].sum() < 1.8 * len(places)
     rooms = [name for k in order if (name := house.room_at(*places[k]))]
     assert sum(a != b for a, b in zip(rooms[:-1], rooms[1:], strict=True)) <= 2 * len(house.rooms)
@@ -142,10 +144,10 @@ def test_where_it_does_not_get_on_it_backs_off(covering):
 @pytest.mark.slow
 def test_ten_minutes_show_the_house():
     robot = robot_at_its_start()
-    joystick = Joystick(robot.house, *robot.pose[:2])
+    joystick = Joystick(robot.place, *robot.pose[:2])
     poses, _, touched = drive(robot, joystick, 600)
-    cells = robot.house.floor.centres()
+    cells = robot.place.floor.centres()
     near = [np.hypot(*(poses[::5, :2] - cell).T).min() <= 0.6 for cell in cells]
     assert not touched and np.mean(near) > 0.88
-    assert {robot.house.room_at(*pose[:2]) for pose in poses} >= {
-        room.name for room in robot.house.rooms}
+    assert {robot.place.room_at(*pose[:2]) for pose in poses} >= {
+        room.name for room in robot.place.rooms}

@@ -9,7 +9,7 @@ from vn_nav.policy.motion import ActionExecutor
 from vn_nav.resources import share_file
 from vn_nav.robot import load_robot
 from vn_sim_bridge.counter_random import Stream, normal
-from vn_sim_bridge.houses.house import clearance
+from vn_sim_bridge.floor.floor_map import clearance
 from vn_sim_bridge.navigation.tasks import wrap_angle
 from vn_sim_bridge.robot.odometry import Uncertainty, advance, drift_errors
 from vn_sim_bridge.robot.simulated_robot import TICK, SimulatedRobot
@@ -62,17 +62,17 @@ def test_short_ticks_and_long_ones_drift_alike():
 
 @pytest.fixture(scope='module')
 def robot():
-    robot = SimulatedRobot(7, 2, robot=BASE, size=16, noise=False)
+    robot = SimulatedRobot('house:7?rooms=2', robot=BASE, size=16, noise=False)
     robot.begin_episode(0)
-    floor = robot.house.floor
-    gap = clearance(floor.origin, floor.free.shape, robot.house.obstacle_rects)[floor.free]
+    floor = robot.place.floor
+    gap = clearance(floor.origin, floor.free.shape, robot.place.obstacle_rects)[floor.free]
     robot.middle = floor.centres()[np.argmax(gap)]  # where nothing is in the way
     return robot
 
 
 def circle(robot, drift, seed=0):
     """Drive on a small circle with pauses from the same start; odometry and true poses."""
-    robot.backend.place(np.array([0]), np.array([[*robot.middle, 0.3, 0.0]]))
+    robot.simulator.place(np.array([0]), np.array([[*robot.middle, 0.3, 0.0]]))
     robot.odometry, robot.odometry_drift, robot.seed = np.zeros(3), drift, seed
     robot.tick_count = 0
     said, true = [], []
@@ -104,7 +104,7 @@ def test_odometry_says_how_far_off_it_is(robot, drift, noise):
     start = np.array([[*robot.middle, 0.0, 0.0]])
     ticks = [(0.4, 0, 0, 0)] * 10 + [(0, 0, 1.5, 0)] * 12 + [(0.3, 0, 1.0, 0)] * 10
     for seed in range(200):
-        robot.backend.place(np.array([0]), start.copy())
+        robot.simulator.place(np.array([0]), start.copy())
         robot.odometry, robot.odometry_drift, robot.seed = np.zeros(3), drift, seed
         robot.uncertainty, robot.tick_count = Uncertainty(drift, TICK), 0
         for velocity in ticks:
@@ -159,7 +159,7 @@ def test_actions_closed_on_odometry_end_where_they_should(robot, exact):
         robot.odometry_drift, robot.seed = drift, 3
         for name in ('forward', 'backward', 'rotate_left', 'rotate_right') * 3:
             action = BASE.action_names.index(name)
-            robot.backend.place(np.array([0]), np.array([[*robot.middle, 0.0, 0.0]]))
+            robot.simulator.place(np.array([0]), np.array([[*robot.middle, 0.0, 0.0]]))
             before = robot.pose.copy()
             executor.begin(action, robot.odometry)
             ticks, over = 0, False

@@ -8,7 +8,7 @@ import pytest
 from vn_nav.policy.motion import ActionExecutor
 from vn_nav.resources import share_file
 from vn_nav.robot import AXES, RobotSpec, load_robot
-from vn_sim_bridge.houses.house import clearance
+from vn_sim_bridge.floor.floor_map import clearance
 from vn_sim_bridge.robot.simulated_base import SimulatedBase
 from vn_sim_bridge.robot.simulated_robot import TICK, SimulatedRobot
 
@@ -20,11 +20,11 @@ STEP = np.array([STANDARD.acceleration(axis) for axis in AXES]) * TICK
 
 def simulated(robot=STANDARD, noise=False, **options):
     """A robot where the most room is, and how much that is [m]."""
-    found = SimulatedRobot(7, 2, robot=robot, size=16, noise=noise, seed=3, **options)
+    found = SimulatedRobot('house:7?rooms=2', robot=robot, size=16, noise=noise, seed=3, **options)
     found.begin_episode(0)
-    floor = found.house.floor
-    gap = clearance(floor.origin, floor.free.shape, found.house.obstacle_rects)[floor.free]
-    found.backend.place(np.array([0]), np.array([[*floor.centres()[np.argmax(gap)], 0.3, 0.0]]))
+    floor = found.place.floor
+    gap = clearance(floor.origin, floor.free.shape, found.place.obstacle_rects)[floor.free]
+    found.simulator.place(np.array([0]), np.array([[*floor.centres()[np.argmax(gap)], 0.3, 0.0]]))
     return found
 
 

@@ -17,10 +17,10 @@ from vn_sim_bridge.tools.walk import Walk, as_text
 
 def test_keys_move_turn_look_and_change_the_light():
     walk = Walk(generate_house(7, rooms=2), 48, load_randomisation('standard'))
-    start, first = walk.backend.poses[0].copy(), walk.look()[0]
-    assert walk.press('a') and walk.backend.poses[0, 2] > start[2]
-    assert walk.press('d') and np.allclose(walk.backend.poses[0], start)
-    assert walk.press('r') and walk.backend.poses[0, 3] < 0 and walk.press('f')
+    start, first = walk.simulator.poses[0].copy(), walk.look()[0]
+    assert walk.press('a') and walk.simulator.poses[0, 2] > start[2]
+    assert walk.press('d') and np.allclose(walk.simulator.poses[0], start)
+    assert walk.press('r') and walk.simulator.poses[0, 3] < 0 and walk.press('f')
     assert walk.press('l') and not np.array_equal(walk.look()[0], first)
     for _ in range(60):
         walk.press('w')

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
+from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_nav.bags.drive import MISFIT, Cutter, Frame, Report, Step, find_topics, hear, synchronise
 from vn_nav.bags.roles import Topics
@@ -188,7 +189,7 @@ def _field_of_view(bag: str | Path, topic: str) -> float | None:
         info = message.message
         focal = float(info.k[0])
         if focal > 0 and info.width > 0 and info.height > 0:
-            return 2 * math.atan(min(info.width, info.height) / 2 / focal)
+            return field_of_view(info.width, info.height, focal)
         break
     return None
 

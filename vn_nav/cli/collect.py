@@ -6,8 +6,8 @@ import argparse
 import time
 from pathlib import Path
 
+from vn_nav.cli.scenes import training_scenes
 from vn_nav.cli.world import add_world, check_backend
-from vn_nav.errors import UserError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,20 +27,15 @@ def run(args: argparse.Namespace) -> int:
     from vn_nav.bags.storage.writer import BagWriter
     from vn_nav.robot import RobotSpec, load_robot
     from vn_sim_bridge.datasets.collect import collect, house_scenes
-    from vn_sim_bridge.houses.splits import SPLITS
     from vn_sim_bridge.render.randomisation import load_randomisation
-    if args.house and args.houses:
-        raise UserError('pictures are of named houses or of the first N', '--house and --houses',
-                        'give one of them')
-    count = 1 if args.houses is None else max(args.houses, 0)
-    houses = args.house or list(SPLITS['train'][:count])
+    names = training_scenes(args)
     robot = load_robot(args.robot) if args.robot else RobotSpec()
-    scenes = house_scenes(houses, args.rooms, args.size, robot,
-                          load_randomisation(args.randomisation), args.seed, args.threads)
+    scenes = house_scenes(names, args.size, robot, load_randomisation(args.randomisation),
+                          args.seed, args.threads)
     begun = time.monotonic()
-    done = collect(scenes, len(houses), args.pictures, robot,
+    done = collect(scenes, len(names), args.pictures, robot,
                    lambda topics: BagWriter(args.out, topics))
     seconds = time.monotonic() - begun
     print(f'{args.out}: {done.pictures:,} pictures in {done.episodes:,} episodes of {done.scenes} '
-          f'house{"s" * (done.scenes > 1)}, {done.pictures / seconds:,.0f} pictures/s')
+          f'scene{"s" * (done.scenes > 1)}, {done.pictures / seconds:,.0f} pictures/s')
     return 0

@@ -22,6 +22,7 @@ COMMANDS = {
     'publish': 'measure a run and write it as a checkpoint to ship',
     'export': 'write a checkpoint as ONNX',
     'bag': 'check and repair recorded drives',
+    'simulators': 'list the simulators, and what each can do',
     'house': 'look at an embedded house',
 }
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vn_nav.cli.world import load_for_house, make_env
+from vn_nav.cli.world import load_for_scenes, make_env
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode, drives_from_bag
 from vn_nav.evaluation.evaluator import (
@@ -34,9 +34,10 @@ from vn_nav.report.tables import TITLES
 from vn_nav.report.terminal import print_table
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
+from vn_nav.scenes import house_scene, rooms_of
 
 TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
-UNSEEN_HOUSE = 8  # seed
+UNSEEN_HOUSE = 8  # seed, of a house with as many rooms as the trained one
 SEED = 2026  # of starts, goals and light
 BASE = 'config/robots/demo_base.yaml'
 HEARS = 60.0  # s until the recorder has met a node
@@ -59,7 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """`vn_nav demo`."""
     folder = args.checkpoint or share_file('models/house')
-    task = load_for_house(folder)[0].info['task']  # refuse before anything is written
+    task = load_for_scenes(folder)[0].info['task']  # refuse before anything is written
     if task != 'image':
         raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
                         task, 'use vn_nav evaluate')
@@ -87,8 +88,10 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
     console = Console()
     loaded = load_checkpoint(folder)
     info = loaded.info
-    places = (('trained', info['houses'][0], episodes, TRAINED_LIMIT),
-              ('unseen', UNSEEN_HOUSE, unseen_episodes, UNSEEN_LIMIT))
+    trained = info['scenes'][0]
+    unseen = house_scene(UNSEEN_HOUSE, rooms_of(trained))
+    places = (('trained', trained, episodes, TRAINED_LIMIT),
+              ('unseen', unseen, unseen_episodes, UNSEEN_LIMIT))
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     for name in ('bag', 'logs'):
@@ -102,8 +105,8 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
     try:
         processes.start('recorder', 'vn_nav.nodes.recorder_node',
                         {'output': str(out / 'bag'), 'topics': RECORDED})
-        for index, (place, house, count, limit) in enumerate(places):
-            _drive(console, processes, folder, loaded, place, house, count, limit,
+        for index, (place, scene, count, limit) in enumerate(places):
+            _drive(console, processes, folder, loaded, place, scene, count, limit,
                    start_time=1.0 + 1e5 * index)
     except ProcessFailure as error:
         console.print(f'[red]vn_nav demo: {error}[/]; logs are in {out / "logs"}')
@@ -125,43 +128,43 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
     return 0
 
 
-def bridge_parameters(checkpoint: LoadedCheckpoint, house: int, count: int, limit: int) -> dict:
-    """What the sim bridge simulates in one house. `control_env` simulates the same."""
+def bridge_parameters(checkpoint: LoadedCheckpoint, scene: str, count: int, limit: int) -> dict:
+    """What the sim bridge simulates in one scene. `control_env` simulates the same."""
     info = checkpoint.info
-    return {'house': house, 'rooms': info['rooms'], 'size': checkpoint.config.size,
+    return {'scene': scene, 'size': checkpoint.config.size,
             'randomisation': info['randomisation'], 'seed': SEED, 'stop': _stop(info),
             'robot': str(share_file(BASE)), 'episodes': count, 'max_decisions': limit}
 
 
-def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, house: int, count: int,
+def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, scene: str, count: int,
                 limit: int):
-    """The same house without ROS: environment k, reset with SEED, begins as episode k over ROS.
+    """The same scene without ROS: environment k, reset with SEED, begins as episode k over ROS.
 
     Goal, its picture, start, light and base are equal. Not equal are the numbers behind motion
     noise, sensor noise, slip and late pictures, which the bridge draws a tick, not a decision,
     and those behind sampled actions.
     """
-    same = bridge_parameters(checkpoint, house, count, limit)
+    same = bridge_parameters(checkpoint, scene, count, limit)
     # The seed of the goal pictures' light is the configuration's, whatever `reset` is given.
-    return make_env([same['house']], same['rooms'], same['episodes'], size=same['size'],
+    return make_env([same['scene']], same['episodes'], size=same['size'],
                     randomisation=same['randomisation'], seed=same['seed'], stop=same['stop'],
                     robot=Path(same['robot']), max_decisions=same['max_decisions'],
                     actions=checkpoint.config.actions)
 
 
 def _drive(console: Console, processes: Processes, folder: Path, checkpoint: LoadedCheckpoint,
-           place: str, house: int, count: int, limit: int, start_time: float) -> None:
+           place: str, scene: str, count: int, limit: int, start_time: float) -> None:
     """All episodes in one house."""
     bridge, policy = f'bridge_{place}', f'policy_{place}'
     note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
-    console.print(f'\n[bold]{place} house[/], seed {house}{note}')
+    console.print(f'\n[bold]{place} house[/], {scene}{note}')
     processes.start(policy, 'vn_nav.nodes.policy_node', {
         'checkpoint': str(folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
         'auto_enable': True, 'seed': SEED}, (f'__node:={policy}',))
     # A robot that is where it wants to be at once would be gone before the recorder has met it.
     _wait_until_heard(processes, policy)
     processes.start(bridge, 'vn_sim_bridge.bridge_node',
-                    bridge_parameters(checkpoint, house, count, limit) | {
+                    bridge_parameters(checkpoint, scene, count, limit) | {
                         'time': 'lock_step', 'start_time': start_time, 'exit_when_done': True})
     seen, progress = 0, time.monotonic()
     with Live(_progress([], count), console=console, refresh_per_second=8) as live:
@@ -218,14 +221,14 @@ def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint) -> dict:
     """Figures from the bag; on the same starts random actions, and the policy without ROS."""
     info, result = checkpoint.info, {}
     stop = _stop(info)
-    for (place, house, count, limit), drive in zip(places, drives, strict=True):
+    for (place, scene, count, limit), drive in zip(places, drives, strict=True):
         figures = summarise([recorded.episode for recorded in drive.episodes])
-        env = control_env(make_env, checkpoint, house, count, limit)
+        env = control_env(make_env, checkpoint, scene, count, limit)
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
         actor = PolicyActor(env, checkpoint.network, info['decoding'], SEED,
                             STOP_THRESHOLD if stop == ARRIVAL else info['stop_threshold'])
         in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
-        result[place] = figures | {'house': house, 'max_decisions': limit, 'stop': stop,
+        result[place] = figures | {'scene': scene, 'max_decisions': limit, 'stop': stop,
                                    'random': summarise(control),
                                    'without_ros': summarise(in_process),
                                    'minus_without_ros': _paired(drive.episodes, in_process)}

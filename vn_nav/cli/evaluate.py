@@ -14,10 +14,11 @@ from vn_nav.cli.options import (
     given_place_options,
     place_options,
 )
+from vn_nav.cli.scenes import scenes_from, split_scenes
 from vn_nav.cli.world import (
     add_world,
     check_backend,
-    check_world,
+    check_version,
     load_for,
     make_env_for,
 )
@@ -29,9 +30,11 @@ from vn_nav.learning.teach_evaluation import DRIVE_SPLITS
 from vn_nav.report import tables
 from vn_nav.report.evaluation_page import evaluation_page
 from vn_nav.robot import load_robot
+from vn_nav.scenes import BAG, HOUSE, house_scene, one_simulator, parse_scene, rooms_of
 
-OF_HOUSES = ('house', 'houses', 'rooms', 'randomisation')  # options without meaning in a bag
-SPLIT_HOUSES = 20  # of a split that the checkpoint does not know, unless told otherwise
+# Options without meaning in a bag.
+OF_SCENES = ('scene', 'house', 'houses', 'rooms', 'randomisation')
+SPLIT_SCENES = 20  # of a split that the checkpoint does not know, unless told otherwise
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
@@ -48,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         'recorded drive, as `vn_nav teach` makes a place of it, not in houses')
     add_place_options(parser)
     parser.add_argument('--houses', type=int, metavar='N', help='the first N houses of each split '
-                        f'(default: all of its own, {SPLIT_HOUSES} others)')
+                        f'(default: all of its own, {SPLIT_SCENES} others)')
     parser.add_argument('--episodes', type=int, default=100,
                         help='of a row at least; the same number in each house')
     parser.add_argument('--max-decisions', type=int, default=300)
@@ -56,7 +59,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--stop-threshold', type=float, metavar='P', help='probability above '
                         "which the arrival head declares a stop (default: the checkpoint's)")
     parser.add_argument('--no-controls', action='store_true')
-    parser.add_argument('--per-scene', action='store_true', help='print each house as well')
+    parser.add_argument('--per-scene', action='store_true', help='print each scene as well')
     parser.add_argument('--json', type=Path, metavar='FILE', help='also write the figures here')
     parser.add_argument('--html', type=Path, metavar='FILE', help='also write a page with maps')
     parser.add_argument('--maps', type=int, default=6, help='of episodes of each split')
@@ -75,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
     def show(name: str, result: dict) -> None:
         split = result['splits'][name]
-        title = (f'{args.checkpoint}, {tables.place(name, split["houses"], bag)}, '
+        title = (f'{args.checkpoint}, {tables.place(name, list(split["scenes"]), bag)}, '
                  f'{args.max_decisions} decisions at most')
         tables.print_rows(split['rows'], title)
         if args.per_scene and not args.bag:
@@ -84,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as decoded:  # the pictures of a drive are mapped from there
         splits, make_env = (
             _drive(args, checkpoint, robot, args.cache or Path(decoded)) if args.bag else
-            _houses(args, checkpoint))
+            _scenes(args, checkpoint))
         done = evaluate(checkpoint, splits, make_env, config, name=str(args.checkpoint), bag=bag,
                         on_split=show)
     if args.json:
@@ -104,8 +107,9 @@ def _check(args: argparse.Namespace) -> None:
     rules = (
         (args.houses is None or args.houses >= 1, 'a split has at least one house', args.houses,
          'raise --houses'),
-        (not (args.house and (args.split or args.houses)), 'houses are given by seed or by split',
-         '--house together with --split or --houses', 'leave one of them out'),
+        (not ((args.house or args.scene) and (args.split or args.houses)),
+         'scenes are given by name or by split',
+         '--scene or --house together with --split or --houses', 'leave one of them out'),
         (args.maps >= 0, 'the number of maps is not negative', args.maps, 'raise --maps'),
     )
     for kept, rule, received, remedy in rules:
@@ -121,7 +125,7 @@ def _check(args: argparse.Namespace) -> None:
 
 def _check_drive(args: argparse.Namespace) -> None:
     """Whether the options are for a recorded drive."""
-    for name in OF_HOUSES:
+    for name in OF_SCENES:
         if getattr(args, name) is not None:
             raise UserError('a recorded drive has pictures and a size of its own',
                             f'--{name} together with --bag', 'leave one of them out')
@@ -131,44 +135,46 @@ def _check_drive(args: argparse.Namespace) -> None:
                             name, 'choose one of them, or leave out --split')
 
 
-def _splits(args: argparse.Namespace, info: dict) -> dict[str, list[int]]:
-    """The houses of each split that is asked for."""
-    from vn_sim_bridge.houses.splits import SPLITS
-    if args.house:
-        return {'houses': list(dict.fromkeys(args.house))}
+def _splits(args: argparse.Namespace, info: dict) -> dict[str, list[str]]:
+    """The scenes of each split that is asked for."""
+    rooms = args.rooms or (_rooms(info) if info['simulator'] == HOUSE else None)
+    if args.house or args.scene:
+        return {'scenes': scenes_from(args, rooms)}
     found = {}
     for name in args.split or ['seen_goals']:
         if name in ('seen_goals', 'unseen_goals'):
-            found[name] = info['houses'][:args.houses]
+            found[name] = info['scenes'][:args.houses]
+            if args.rooms:
+                found[name] = list(dict.fromkeys(
+                    house_scene(int(parse_scene(scene).place), rooms) for scene in found[name]))
             if not found[name]:
-                raise UserError('seen and unseen goals are in the houses of the checkpoint',
-                                'a checkpoint that names none', 'give --house or another --split')
-        elif name in SPLITS:
-            found[name] = list(SPLITS[name][:args.houses or SPLIT_HOUSES])
-            known = sorted(set(found[name]) & set(info['houses']))
-            if name != 'train' and known:
-                raise UserError(f'the checkpoint was not trained in houses of split {name}',
-                                f'house {known[0]}', 'choose another split')
+                raise UserError('seen and unseen goals are in the scenes of the checkpoint',
+                                'a checkpoint that names none', 'give --scene, --house or another '
+                                '--split')
         else:
-            raise UserError(f'a split is one of {", ".join(SPLITS)}, seen_goals, unseen_goals',
-                            name, 'choose one of them')
+            found[name] = split_scenes(info['simulator'], name, args.houses or SPLIT_SCENES, rooms)
+            known = [scene for scene in found[name] if scene in info['scenes']]
+            if name != 'train' and known:
+                raise UserError(f'the checkpoint was not trained in scenes of split {name}',
+                                known[0], 'choose another split')
     return found
 
 
-def _houses(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
-    """The houses of each split, and what makes environments of them."""
-    from vn_sim_bridge.floor.contacts import WORLD_VERSION
-    check_world(checkpoint.info, WORLD_VERSION)
-    rooms = args.rooms or checkpoint.info['rooms']
-    if rooms is None:
-        raise UserError('houses have a number of rooms', 'a checkpoint that names none',
-                        'give --rooms')
-    splits = _splits(args, checkpoint.info)
+def _rooms(info: dict) -> int | None:
+    """Rooms of the houses that a checkpoint knows."""
+    return rooms_of(info['scenes'][0]) if info['scenes'] else None
 
-    def make(split: str, seeds, environments: int, stop: str):
+
+def _scenes(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
+    """The scenes of each split, and what makes environments of them."""
+    splits = _splits(args, checkpoint.info)
+    for scenes in splits.values():
+        check_version(checkpoint.info, simulator=one_simulator(scenes)[0])
+
+    def make(split: str, names, environments: int, stop: str):
         return make_env_for(
-            checkpoint, seeds, rooms, environments, stop=stop, robot=args.robot,
-            own=set(splits[split]) <= set(checkpoint.info['houses']),
+            checkpoint, names, environments, stop=stop, robot=args.robot,
+            own=set(splits[split]) <= set(checkpoint.info['scenes']),
             randomisation=args.randomisation, max_decisions=args.max_decisions,
             goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0)
     return splits, make
@@ -180,7 +186,7 @@ def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[di
     from vn_sim_bridge import teach_place as place
     graph = read_place(args.bag, place_options(args), place.build_graph, robot,
                        checkpoint.config.size, cache)
-    check_world(checkpoint.info, graph.world_version)
+    check_version(checkpoint.info, simulator=BAG, version=graph.world_version)
     graphs = {'all_goals': graph}
     if args.split:
         own, others = place.held_out(graph)
@@ -193,4 +199,4 @@ def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[di
     def make(split: str, _, environments: int, stop: str):
         return place.make_env(graphs[split], robot, environments, stop=stop, light=True,
                               task=checkpoint.info['task'], max_decisions=args.max_decisions)
-    return {name: [graph.seed] for name in graphs}, make
+    return {name: [graph.name] for name in graphs}, make

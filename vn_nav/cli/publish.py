@@ -6,12 +6,14 @@ import argparse
 import datetime
 from pathlib import Path
 
-from vn_nav.cli.world import load_for_house, machine, make_env_for
+from vn_nav.cli.world import load_for_scenes, machine, make_env_for
+from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.measurement import EvaluateConfig, measure_checkpoint
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.report import tables
 from vn_nav.robot import load_robot
+from vn_nav.scenes import HOUSE, house_scene, rooms_of
 
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that are tried
 
@@ -27,19 +29,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """`vn_nav publish`."""
-    checkpoint, _ = load_for_house(args.source, args.robot)
+    checkpoint, _ = load_for_scenes(args.source, args.robot)
     info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
+    scenes = info['scenes']
+    if info['simulator'] != HOUSE or not scenes:
+        raise UserError('a policy of embedded houses is published', f'{info["simulator"]} '
+                        f'{", ".join(scenes)}', 'publish one that was trained in houses')
+    unseen = house_scene(args.unseen, rooms_of(scenes[0]))
     save_checkpoint(args.target, checkpoint.network, info, half=True)
     shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
-    houses = info['houses']
     if 'arrival' in shipped.config.heads:
         info['stop_threshold'] = _stop_threshold(shipped, args)
         save_checkpoint(args.target, shipped.network, info, half=True)
         shipped = load_checkpoint(args.target)
     info['results'] = {}
-    for place, seeds in (('trained house', houses), (f'unseen house {args.unseen}',
-                                                     [args.unseen])):
-        rows = _measure(shipped, seeds, args)
+    for place, names in (('trained house', scenes),
+                         (f'unseen house {args.unseen}', [unseen])):
+        rows = _measure(shipped, names, args)
         results = evaluator.figures(rows)
         tables.print_rows(results, place)
         for stop, row in results.items():
@@ -54,23 +60,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _measure(checkpoint, houses, args: argparse.Namespace, **changes) -> evaluator.Rows:
-    """Episodes of a checkpoint in some houses."""
-    own = set(houses) <= set(checkpoint.info['houses'])
+def _measure(checkpoint, scenes, args: argparse.Namespace, **changes) -> evaluator.Rows:
+    """Episodes of a checkpoint in some scenes."""
+    own = set(scenes) <= set(checkpoint.info['scenes'])
 
-    def make(seeds, environments: int, stop: str):
-        return make_env_for(checkpoint, seeds, checkpoint.info['rooms'], environments, stop=stop,
-                            robot=args.robot, own=own)
+    def make(names, environments: int, stop: str):
+        return make_env_for(checkpoint, names, environments, stop=stop, robot=args.robot, own=own)
     config = EvaluateConfig(episodes=args.episodes, **changes,
                             robot=load_robot(args.robot) if args.robot else None)
-    return measure_checkpoint(checkpoint, houses, make, config)
+    return measure_checkpoint(checkpoint, scenes, make, config)
 
 
 def _stop_threshold(checkpoint, args: argparse.Namespace) -> float:
     """The probability of arrival that is best declared at, on starts that no figure is from."""
     success = {}
     for threshold in STOP_THRESHOLDS:
-        rows = _measure(checkpoint, checkpoint.info['houses'][:16], args, seed=20_000,
+        rows = _measure(checkpoint, checkpoint.info['scenes'][:16], args, seed=20_000,
                         controls=(), stop_threshold=threshold)
         (row,) = evaluator.figures(rows)[evaluator.DECLARED].values()
         success[threshold] = row['success']

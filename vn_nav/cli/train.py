@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import math
 from pathlib import Path
 
 from vn_nav.cli.options import command_words, parse_changes
+from vn_nav.cli.scenes import training_scenes
 from vn_nav.cli.world import add_world, check_backend, machine, make_env
 from vn_nav.errors import UserError
 from vn_nav.learning.over_ros import config_over_ros
@@ -15,6 +17,7 @@ from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.learning.pretrain_job import load_bags, print_line
 from vn_nav.learning.trainer import train
 from vn_nav.robot import DRIVE_ACTIONS
+from vn_nav.scenes import ROOMS
 
 # Options that are numbers of `TrainConfig`, with their words.
 NUMBERS = {
@@ -115,7 +118,7 @@ def _check(args: argparse.Namespace) -> None:
         if given:
             raise UserError(rule, ' '.join(given), remedy)
     if args.env == 'ros':
-        refuse(('house', 'houses', 'envs', 'pair_minutes', 'goal_variants'),
+        refuse(('scene', 'house', 'houses', 'envs', 'pair_minutes', 'goal_variants'),
                'where robots drive is not for their trainer to choose',
                'leave these out with --env ros')
     else:
@@ -124,9 +127,6 @@ def _check(args: argparse.Namespace) -> None:
     if not args.bags:
         refuse(('bag_share', 'topics', 'cache'), 'these are for learning from bags',
                'add --bags BAG')
-    if args.house and args.houses:
-        raise UserError('a training is in named houses or in the first N', '--house and --houses',
-                        'give one of them')
 
 
 def train_config(args: argparse.Namespace) -> TrainConfig:
@@ -152,11 +152,10 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     if args.env == 'ros':
         return _over_ros(args)
-    from vn_sim_bridge.houses.splits import SPLITS
-    from vn_sim_bridge.navigation.env import PRIVILEGED
-    houses = args.house or list(SPLITS['train'][:args.houses or 1])
+    from vn_sim_bridge.navigation.env_config import PRIVILEGED
+    scenes = training_scenes(args)
     config, world = train_config(args), world_options(args)
-    env = make_env(houses, args.rooms, world.pop('envs'), robot=args.robot, threads=config.threads,
+    env = make_env(scenes, world.pop('envs'), robot=args.robot, threads=config.threads,
                    randomisation=args.randomisation, size=args.size, seed=args.seed,
                    device=config.device,
                    actions=tuple(args.actions.split(',')), task=args.task,
@@ -165,14 +164,15 @@ def run(args: argparse.Namespace) -> int:
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
     bags = _bag_mix(args, config, env.robot)
     info = _info(args, config, env, bags) | {
-        'houses': houses, 'rooms': args.rooms, 'randomisation': args.randomisation,
+        'simulator': env.simulator_name, 'scenes': scenes, 'randomisation': args.randomisation,
         'goals_per_room': args.goals_per_room, 'goal_variants': args.goal_variants,
         'task': args.task, 'objects': args.objects}
     pairs = None
     if config.pair_minutes and not args.init:
         pairs = _pair_sources(args, config)
-    print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
-                pairs=pairs, bags=bags))
+    with contextlib.closing(env):
+        print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
+                    pairs=pairs, bags=bags))
     return 0
 
 
@@ -233,8 +233,7 @@ def _over_ros(args: argparse.Namespace) -> int:
             print(line, flush=True)
         env.listen(config.privileged)
         info = _info(args, config, env, bags) | {
-            'houses': [env.scene['house']] if 'house' in env.scene else [],
-            'rooms': env.scene.get('rooms')}
+            'simulator': env.simulator_name, 'scenes': env.scene_names}
 
         def say(row: dict) -> None:
             print(f'{row["frames"]:,} frames: {env.steps / env.seconds:.2f} steps/s over ROS, '
@@ -251,7 +250,7 @@ def _pair_sources(args: argparse.Namespace, config):
         from vn_sim_bridge.datasets.house_pairs import PairSampler
         from vn_sim_bridge.houses.splits import SPLITS
         from vn_sim_bridge.render.randomisation import load_randomisation
-        options = {'rooms': args.rooms, 'size': args.size, 'threads': config.threads,
+        options = {'rooms': args.rooms or ROOMS, 'size': args.size, 'threads': config.threads,
                    'robot': load_robot(args.robot) if args.robot else None,
                    'randomisation': load_randomisation(args.randomisation)}
         return (PairSampler(SPLITS['train'][:config.pair_houses], seed=args.seed, **options),

@@ -8,17 +8,21 @@ import os
 import platform
 from pathlib import Path
 
+from vn_nav.cli.scenes import add_scene_options
 from vn_nav.errors import UserError
+from vn_nav.scenes import BAG, ROOMS
 
-BACKENDS = ('house',)
+BACKENDS = ('house',)  # of --house and --houses; other scenes are named by --scene
 
 
 def add_world(parser: argparse.ArgumentParser, defaults: bool = True) -> None:
     """Options of the simulated world."""
     parser.add_argument('--backend', default='house', help=f'one of: {", ".join(BACKENDS)}')
     parser.add_argument('--house', type=int, action='append', metavar='SEED',
-                        help='seed of a house; may be given several times')
-    parser.add_argument('--rooms', type=int, default=5 if defaults else None)
+                        help='seed of a house, short for --scene house:SEED; may be given several '
+                        'times')
+    parser.add_argument('--rooms', type=int, help=f'of the houses by seed (default {ROOMS})')
+    add_scene_options(parser)
     parser.add_argument('--robot', type=Path, metavar='YAML',
                         help='robot file (config/robots/); default: the standard robot')
     parser.add_argument('--randomisation', default='none' if defaults else None, metavar='NAME',
@@ -32,16 +36,17 @@ def check_backend(name: str) -> None:
         raise UserError(f'the backend is one of: {", ".join(BACKENDS)}', name, 'choose one')
 
 
-def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, threads: int = 1,
+def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
              randomisation: str | Path = 'none', device: str = 'cpu', **options):
-    """A `NavigationEnv` of embedded houses; without a robot file with the standard robot.
+    """A `NavigationEnv` of some scenes; without a robot file with the standard robot.
 
     On a device other than the CPU it is a `WarpNavigationEnv`.
     """
     from vn_nav.robot import load_robot
-    from vn_sim_bridge.navigation.env import EnvConfig, NavigationEnv
+    from vn_sim_bridge.navigation.env import NavigationEnv
+    from vn_sim_bridge.navigation.env_config import EnvConfig
     from vn_sim_bridge.render.randomisation import load_randomisation
-    config = EnvConfig(houses=tuple(houses), rooms=rooms, num_envs=envs,
+    config = EnvConfig(scenes=tuple(scenes), num_envs=envs,
                        randomisation=load_randomisation(randomisation), **options)
     spec = load_robot(robot) if robot else None
     if device == 'cpu':
@@ -51,26 +56,35 @@ def make_env(houses, rooms: int, envs: int, *, robot: Path | None = None, thread
     return WarpNavigationEnv(config, spec, device=device)
 
 
-def make_env_for(checkpoint, houses, rooms: int, envs: int, *, stop: str, own: bool,
+def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
                  max_decisions: int = 300, goal_seed: int = 0):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
 
     Args:
         checkpoint: the policy.
-        houses, rooms, envs, robot: see `make_env`.
+        scenes, envs, robot: see `make_env`.
         stop: what ends an episode before its limit, 'arrival' or 'declared'.
-        own: the houses are those that it was trained in, with as many goals.
+        own: the scenes are those that it was trained in, with as many goals.
         randomisation: None: that of the training.
         max_decisions: of an episode.
         goal_seed: 0 for the goals of the training.
+
+    Raises:
+        UserError: the checkpoint belongs to another version of the simulator.
     """
     info = checkpoint.info
-    return make_env(houses, rooms, envs, robot=robot, size=checkpoint.config.size,
-                    randomisation=randomisation or info['randomisation'], task=info['task'],
-                    objects=info['objects'], actions=checkpoint.config.actions,
-                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
-                    goals_per_room=info['goals_per_room'] if own else 1)
+    env = make_env(scenes, envs, robot=robot, size=checkpoint.config.size,
+                   randomisation=randomisation or info['randomisation'], task=info['task'],
+                   objects=info['objects'], actions=checkpoint.config.actions,
+                   max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
+                   goals_per_room=info['goals_per_room'] if own else 1)
+    try:
+        check_version(info, simulator=env.simulator_name, version=env.world_version)
+    except UserError:
+        env.close()
+        raise
+    return env
 
 
 def _check_gpu(device: str) -> None:
@@ -124,27 +138,36 @@ def load_for(path: Path, robot: Path | None = None):
     return checkpoint, spec
 
 
-def load_for_house(path: Path, robot: Path | None = None):
-    """As `load_for`, of a policy that was trained in embedded houses of the present version."""
-    from vn_sim_bridge.floor.contacts import WORLD_VERSION
+def load_for_scenes(path: Path, robot: Path | None = None):
+    """As `load_for`, of a policy whose simulator has the version that it was trained in."""
     checkpoint, spec = load_for(path, robot)
-    _check_version(checkpoint.info['world_version'], WORLD_VERSION)
+    check_version(checkpoint.info, simulator=checkpoint.info['simulator'])
     return checkpoint, spec
 
 
-def check_world(info: dict, present: str) -> None:
-    """Whether figures of a checkpoint mean something in the present world.
+def check_version(info: dict, *, simulator: str, version: str | None = None) -> None:
+    """Whether figures of a checkpoint mean something in a simulator.
 
-    Pictures of a real robot, and those of several simulators, are of no world version: such a
-    policy may be tried anywhere, and any policy in such pictures.
+    A version belongs to a simulator: between two simulators none is compared. Pictures of a real
+    robot, and those of several simulators, are of no version: such a policy may be tried
+    anywhere, and any policy in such pictures.
+
+    Args:
+        info: of the checkpoint.
+        simulator: where it is to drive.
+        version: of it; None: the present one.
+
+    Raises:
+        UserError: pixels, places or motion of its simulator have changed since.
     """
     from vn_nav.bags.drive import RECORDED
-    if RECORDED not in (info['world_version'], present):
-        _check_version(info['world_version'], present)
-
-
-def _check_version(trained: str, present: str) -> None:
-    if trained != present:
-        raise UserError(f'the checkpoint belongs to world version {present!r}', trained,
+    from vn_sim_bridge.simulators import simulator_class
+    if version is None:
+        version = simulator_class(simulator).version
+    trained = info['world_version']
+    # A drive's version is that of the simulator that drew its pictures.
+    same = simulator == info['simulator'] or BAG in (simulator, info['simulator'])
+    if same and RECORDED not in (trained, version) and trained != version:
+        raise UserError(f'the checkpoint belongs to world version {version!r}', trained,
                         'train it again (vn_nav train), or use the version of vn_nav that it '
                         'came with')

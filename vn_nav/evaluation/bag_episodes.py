@@ -111,7 +111,8 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
         if not ends[k]:
             continue  # cut off: no figure counts it
         trajectory = np.array(poses[k]).reshape(-1, 3)
-        episode = _measure(facts, trajectory, rewards[k], touched[k], ends[k])
+        episode = _measure(facts, trajectory, rewards[k], touched[k], ends[k],
+                           drives[place].scene['tick'])
         if drives[place].scene.get('stop') == 'declared':
             # A decision is judged just before its last pose is published, which is the pose of
             # the tick before: the robot has come to rest.
@@ -138,14 +139,15 @@ def _reached(poses: np.ndarray, goal: list, scene: dict) -> bool:
 
 
 def _measure(facts: dict, trajectory: np.ndarray, rewards: list, touched: list,
-             ends: list) -> Episode:
+             ends: list, tick: float) -> Episode:
     steps = np.hypot(*np.diff(trajectory[:, :2], axis=0).T) if len(trajectory) > 1 else [0.0]
     goal = facts['goal_pose']
     last = trajectory[-1] if len(trajectory) else np.full(3, np.nan)
     turn = (last[2] - goal[2] + math.pi) % (2 * math.pi) - math.pi
     return Episode(
-        success=ends[-1] == 1 and sum(rewards) > 0, start_distance=facts['start_distance'],
+        success=ends[-1] == 1 and sum(rewards) > 0,
+        start_distance=math.nan if (way := facts['start_distance']) is None else way,
         path_length=float(np.sum(steps)), decisions=len(rewards), collisions=int(sum(touched)),
         # At the speed of the recorded base; straight-line distance: a bag has no floor map.
-        seconds=0.05 * len(trajectory), stop_distance=math.dist(last[:2], goal[:2]),
+        seconds=tick * len(trajectory), stop_distance=math.dist(last[:2], goal[:2]),
         stop_heading=float(abs(turn)), reward=float(sum(rewards)), goal=facts['room'])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from vn_nav.policy.network import Policy
 from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
+from vn_nav.vector_env import MeasuredVectorEnv
 
 Actor = Callable[[dict, np.ndarray], np.ndarray]  # (observation, reset [N]) -> actions [N]
 Rows = dict[str, dict[str, list[Episode]]]  # 'arrival' or 'declared', then a row's name
@@ -19,16 +21,17 @@ OTHER, WRONG, BLANK, RANDOM, SHORTEST = (
     'other decoding', 'wrong goal', 'blank goal', 'random actions', 'shortest path')
 CONTROLS = (OTHER, WRONG, BLANK, RANDOM, SHORTEST)
 STOP_THRESHOLD = 0.5  # of the arrival head's probability, where nobody chose another
-HOUSES_AT_ONCE = 16  # in memory
-ENVIRONMENTS = 50  # at most at once, unless there are more houses
+SCENES_AT_ONCE = 16  # in memory
+ENVIRONMENTS = 50  # at most at once, unless there are more scenes
 
 
-def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpec,
-                 show: Callable[[float], None] = lambda share: None) -> list[Episode]:
+def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: int,
+                 robot: RobotSpec, show: Callable[[float], None] = lambda share: None
+                 ) -> list[Episode]:
     """Run a fixed number of episodes in each environment (early finishers would flatter).
 
     Args:
-        env: as `NavigationEnv`; its rewards should be the sparse ones.
+        env: its rewards should be the sparse ones.
         actor: chooses the actions; what it says in an attribute `filtered`, as `PolicyActor` has
             it, is counted.
         episodes: at least this many; rounded up to the same number in each environment.
@@ -78,7 +81,7 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
                 stop_distance=float(info['distance'][n]),
                 stop_heading=float(info['heading_error'][n]), reward=float(reward[n]),
                 goal=env.goal_rooms[info['goal'][n]],
-                scene=int(env.houses[env.house_index[n]].seed),
+                scene=env.places[env.place_index[n]].name,
                 declared=(None if env.declare_action is None
                           else bool(actions[n] == env.declare_action)),
                 reached=bool(reached[n]),
@@ -91,12 +94,12 @@ def run_episodes(env, actor: Actor, episodes: int, *, seed: int, robot: RobotSpe
     return [episode for own in found for episode in own[:each]]
 
 
-def _goal_poses(env) -> np.ndarray | None:
+def _goal_poses(env: MeasuredVectorEnv) -> np.ndarray | None:
     """[G,3] where the goals are; None where the task's goal is no pose."""
     return env.goal_poses[:, :3] if env.config.task == 'image' else None
 
 
-def random_actor(env, seed: int) -> Actor:
+def random_actor(env: MeasuredVectorEnv, seed: int) -> Actor:
     """Uniform random actions; where a stop is declared, that is one of them."""
     rng, choices = np.random.default_rng(seed), int(env.single_action_space.n)
     return lambda observation, reset: rng.integers(0, choices, env.num_envs)
@@ -111,15 +114,15 @@ class PolicyActor:
         decoding: 'sample' or 'greedy'.
         seed: of the sampled actions.
         threshold: probability of having arrived above which it declares.
-        known: houses that it was trained in, for a network with layers for several scenes.
+        known: scenes that it was trained in, for a network with layers for several scenes.
 
     Attributes:
         filtered: [2,N] bool: where the action filter acted on the last actions, and where it
             changed them; None: the policy has no filter, or has not acted yet.
     """
 
-    def __init__(self, env, network: Policy, decoding: str, seed: int,
-                 threshold: float = STOP_THRESHOLD, known: Sequence[int] = ()):
+    def __init__(self, env: MeasuredVectorEnv, network: Policy, decoding: str, seed: int,
+                 threshold: float = STOP_THRESHOLD, known: Sequence[str] = ()):
         self.env, self.threshold = env, threshold
         self.known = known if network.config.scenes > 1 else ()
         self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
@@ -128,7 +131,7 @@ class PolicyActor:
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
         scene = None
         if self.known:
-            scene = scene_numbers([self.env.houses[house].seed for house in self.env.house_index],
+            scene = scene_numbers([self.env.places[place].name for place in self.env.place_index],
                                   self.known)
         actions = self.policy.act(observation, self.env.goals, reset, scene)
         declares = np.zeros(len(actions), bool)
@@ -144,25 +147,25 @@ class PolicyActor:
         return bool(np.isfinite(self.policy.arrival).all())
 
 
-def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decoding: str,
+def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decoding: str,
             episodes: int = 100, controls: Sequence[str] = CONTROLS,
-            threshold: float | None = None, seed: int = 10_000, known: Sequence[int] = (),
+            threshold: float | None = None, seed: int = 10_000, known: Sequence[str] = (),
             robot: RobotSpec | None = None) -> Rows:
-    """Episodes of a policy and of its controls, the same number in each house.
+    """Episodes of a policy and of its controls, the same number in each scene.
 
     A network with an arrival head is measured a second time, with declared stops.
 
     Args:
-        make_env: (houses, environments, stop) -> vector environment in which environment i lives
-            in house i modulo their number; `stop` is 'arrival' or 'declared'.
+        make_env: (scenes, environments, stop) -> vector environment in which environment i lives
+            in scene i modulo their number; `stop` is 'arrival' or 'declared'.
         network: the policy.
-        houses: seeds.
+        scenes: their names.
         decoding: 'sample' or 'greedy'.
         episodes: at least this many a row.
         controls: which of `CONTROLS`, on the same starts.
         threshold: of the arrival head; None: 0.5.
         seed: of environments and sampled actions.
-        known: houses that the policy was trained in, see `PolicyActor`.
+        known: scenes that the policy was trained in, see `PolicyActor`.
         robot: for durations; the standard robot if left out.
 
     Returns:
@@ -172,27 +175,28 @@ def measure(make_env: Callable, network: Policy, houses: Sequence[int], *, decod
     robot = robot or RobotSpec()
     rows: Rows = {}
     threshold = STOP_THRESHOLD if threshold is None else threshold
-    each = -(-episodes // len(houses))
-    for chunk, begin in enumerate(range(0, len(houses), HOUSES_AT_ONCE)):
-        part = list(houses[begin:begin + HOUSES_AT_ONCE])
+    each = -(-episodes // len(scenes))
+    for chunk, begin in enumerate(range(0, len(scenes), SCENES_AT_ONCE)):
+        part = list(scenes[begin:begin + SCENES_AT_ONCE])
         rounds = -(-each // max(1, ENVIRONMENTS // len(part)))
         environments = len(part) * -(-each // rounds)
         for stop in (ARRIVAL, DECLARED):
-            env = make_env(part, environments, stop)
-            actors = make_actors(env, network, decoding, controls, threshold, seed + chunk, known)
-            for name, (actor, shown) in actors.items():
-                env.set_shown_goal(shown)
-                rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
-                    env, actor, rounds * environments, seed=seed + chunk, robot=robot))
-            own, _ = next(iter(actors.values()))
-            if env.config.task != 'image' or not (
-                    isinstance(own, PolicyActor) and own.knows_arrival):
-                break  # nothing to declare, or nobody to declare it
+            with contextlib.closing(make_env(part, environments, stop)) as env:
+                actors = make_actors(env, network, decoding, controls, threshold, seed + chunk,
+                                     known)
+                for name, (actor, shown) in actors.items():
+                    env.set_shown_goal(shown)
+                    rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
+                        env, actor, rounds * environments, seed=seed + chunk, robot=robot))
+                own, _ = next(iter(actors.values()))
+                if env.config.task != 'image' or not (
+                        isinstance(own, PolicyActor) and own.knows_arrival):
+                    break  # nothing to declare, or nobody to declare it
     return rows
 
 
 def make_actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
-                seed: int, known: Sequence[int] = ()) -> dict[str, tuple[Actor, str]]:
+                seed: int, known: Sequence[str] = ()) -> dict[str, tuple[Actor, str]]:
     """Who drives in each row, and which goal picture it is shown; the policy itself first."""
     def policy(rule: str = decoding) -> Actor:
         return PolicyActor(env, network, rule, seed, threshold, known)
@@ -217,12 +221,24 @@ def figures(rows: Rows) -> dict[str, dict[str, dict]]:
             for stop, own in rows.items()}
 
 
-def by_scene(rows: Rows) -> dict[int, Rows]:
-    """The same rows for each house alone, by its seed."""
-    scenes: dict[int, Rows] = {}
+def by_scene(rows: Rows) -> dict[str, Rows]:
+    """The same rows for each scene alone, by its name."""
+    scenes: dict[str, Rows] = {}
     for stop, own in rows.items():
         for name, episodes in own.items():
             for episode in episodes:
                 scenes.setdefault(episode.scene, {}).setdefault(stop, {}).setdefault(
                     name, []).append(episode)
     return scenes
+
+
+def split_figures(rows: Rows, scenes: Sequence[str]) -> dict[str, dict]:
+    """What a result says of a split: all its rows, and those of each of its scenes.
+
+    Args:
+        rows: episodes, as `measure` returns them.
+        scenes: names, in the order to be shown in.
+    """
+    own = by_scene(rows)
+    return {'rows': figures(rows),
+            'scenes': {scene: figures(own[scene]) for scene in scenes if scene in own}}

@@ -22,7 +22,7 @@ class EvaluateConfig:
         UserError: values outside their range.
     """
 
-    episodes: int = 100  # of a row at least; the same number in each house
+    episodes: int = 100  # of a row at least; the same number in each scene
     seed: int = 10_000  # of environments and sampled actions
     decoding: str | None = None  # sample or greedy; None: as the checkpoint was measured
     controls: tuple[str, ...] = evaluator.CONTROLS  # on the same starts
@@ -55,12 +55,12 @@ class Evaluation:
     Attributes:
         result: figures by split, kind of stop and row; JSON has what it holds.
         measured: the episodes, by split.
-        plans: floor plans of the houses by seed, by split.
+        plans: floor plans by split and scene; None: the scene has none.
     """
 
     result: dict
     measured: dict[str, evaluator.Rows]
-    plans: dict[str, dict[int, Any]]
+    plans: dict[str, dict[str, Any]]
 
 
 def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions: int,
@@ -70,41 +70,42 @@ def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions
     Args:
         info: of the checkpoint; its `sha256` is left out where the weights still change.
         checkpoint: its name.
-        bag: name of the recorded drive; None: simulated houses.
+        bag: name of the recorded drive; None: scenes of a simulator.
         max_decisions: of an episode.
         decoding: 'sample' or 'greedy'.
         seed: of the episodes.
     """
     return {'checkpoint': checkpoint,
             **({'sha256': info['sha256']} if 'sha256' in info else {}),
-            'bag': bag, 'world_version': info['world_version'], 'task': info['task'],
+            'bag': bag, 'simulator': info['simulator'],
+            'world_version': info['world_version'], 'task': info['task'],
             'decoding': decoding, 'max_decisions': max_decisions, 'seed': seed,
             'date': datetime.date.today().isoformat(), 'splits': {}}
 
 
-def split_result(houses: Sequence[int], measured: evaluator.Rows) -> dict:
-    """One split of a result: its figures, and those of each house alone."""
-    scenes = evaluator.by_scene(measured)
-    return {'houses': list(houses), 'rows': evaluator.figures(measured),
-            'scenes': {str(seed): evaluator.figures(scenes[seed]) for seed in houses}}
-
-
-def measure_checkpoint(checkpoint: LoadedCheckpoint, houses: Sequence[int], make_env: Callable,
+def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make_env: Callable,
                        config: EvaluateConfig) -> evaluator.Rows:
-    """Episodes of a checkpoint in some houses; see `evaluator.measure`."""
-    info, controls = checkpoint.info, config.controls
+    """Episodes of a checkpoint in some scenes; see `evaluator.measure`."""
+    info, controls = checkpoint.info, list(config.controls)
     if info['task'] == 'collect':  # no goal: none to show wrong, and no shortest path to it
-        controls = tuple(name for name in controls
-                         if name in (evaluator.OTHER, evaluator.RANDOM))
+        controls = [name for name in controls if name in (evaluator.OTHER, evaluator.RANDOM)]
+
+    def make(names: Sequence[str], environments: int, stop: str):
+        env = make_env(names, environments, stop)
+        can = env.simulator.capabilities
+        if not (can.geodesic or env.simulator.planner) and evaluator.SHORTEST in controls:
+            controls.remove(evaluator.SHORTEST)
+        return env
+
     return evaluator.measure(
-        make_env, checkpoint.network, houses, known=info['houses'],
+        make, checkpoint.network, scenes, known=info['scenes'],
         decoding=config.decoding or info['decoding'], episodes=config.episodes,
         controls=controls, seed=config.seed, robot=config.robot,
         threshold=(info.get('stop_threshold') if config.stop_threshold is None
                    else config.stop_threshold))
 
 
-def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[int]],
+def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
              make_env: Callable, config: EvaluateConfig | None = None, *, name: str = '',
              bag: str | None = None,
              on_split: Callable[[str, dict], None] = lambda split, result: None) -> Evaluation:
@@ -112,12 +113,12 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[int]],
 
     Args:
         checkpoint: the policy.
-        splits: seeds of the houses by the split's name.
-        make_env: (split, houses, environments, stop) -> vector environment in which environment
-            i lives in house i modulo their number; `stop` is 'arrival' or 'declared'.
+        splits: names of the scenes by the split's name.
+        make_env: (split, scenes, environments, stop) -> vector environment in which environment
+            i lives in scene i modulo their number; `stop` is 'arrival' or 'declared'.
         config: numbers; None: the defaults.
         name: of the checkpoint, for the result.
-        bag: name of the recorded drive that the environments are made of; None: houses.
+        bag: name of the recorded drive that the environments are made of; None: scenes.
         on_split: called with the name and the whole result after each split.
 
     Raises:
@@ -127,21 +128,21 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[int]],
     if not splits:
         raise UserError('there is a split to measure in', dict(splits), 'name one')
     done = Evaluation({}, {}, {})
-    for split, houses in splits.items():
+    for split, scenes in splits.items():
         plans = done.plans[split] = {}
         limits: list[int] = []
 
-        def make(seeds: Sequence[int], environments: int, stop: str, split: str = split,
+        def make(names: Sequence[str], environments: int, stop: str, split: str = split,
                  plans: dict = plans, limits: list[int] = limits):
-            env = make_env(split, seeds, environments, stop)
-            plans.update({house.seed: house.floor_plan() for house in env.houses})
+            env = make_env(split, names, environments, stop)
+            plans.update({place.name: place.plan() for place in env.places})
             limits.append(env.config.max_decisions)
             return env
 
-        measured = done.measured[split] = measure_checkpoint(checkpoint, houses, make, config)
+        measured = done.measured[split] = measure_checkpoint(checkpoint, scenes, make, config)
         done.result = done.result or new_result(
             checkpoint.info, checkpoint=name, bag=bag, max_decisions=limits[0],
             decoding=config.decoding or checkpoint.info['decoding'], seed=config.seed)
-        done.result['splits'][split] = split_result(houses, measured)
+        done.result['splits'][split] = evaluator.split_figures(measured, scenes)
         on_split(split, done.result)
     return done

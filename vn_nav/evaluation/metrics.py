@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-ARRIVAL_RADIUS = 0.6  # m: what the start distance is shortened by in SPL
+from vn_nav.arrival import ARRIVAL_RADIUS
 
 
 def _hidden():
@@ -25,7 +25,7 @@ class Episode:
     """The outcome of one journey to one picture."""
 
     success: bool
-    start_distance: float  # m, geodesic, from start to goal
+    start_distance: float  # m, geodesic, from start to goal; NaN: nobody knows the ways
     path_length: float  # m really moved
     decisions: int
     collisions: int  # decisions that touched something
@@ -34,7 +34,7 @@ class Episode:
     stop_heading: float  # rad, unsigned, at the end
     reward: float = 0.0  # undiscounted return
     goal: str = ''
-    scene: int = 0  # seed of the house
+    scene: str = ''  # its name
     declared: bool | None = None  # whether the policy said "arrived"; None: nobody asked it to
     reached: bool = False  # was at the goal at the end of some decision, declared or not
     # Decisions at which the policy's action filter acted, and changed the action; None: no filter.
@@ -48,8 +48,11 @@ class Episode:
 def path_efficiency(episode: Episode) -> float:
     """S * l / max(p, l): the episode's share in SPL (Anderson et al. 2018).
 
-    l is the geodesic start distance less the arrival radius, p the metres really moved.
+    l is the geodesic start distance less the arrival radius, p the metres really moved. NaN where
+    nobody knows the shortest way.
     """
+    if math.isnan(episode.start_distance):
+        return math.nan  # nobody knows the shortest way
     shortest = max(episode.start_distance - ARRIVAL_RADIUS, 0.0)
     longest = max(episode.path_length, shortest)
     return float(episode.success) * (shortest / longest if longest > 0 else 1.0)
@@ -65,8 +68,15 @@ def bootstrap_interval(values: Sequence[float], *, samples: int = 2000, seed: in
     return float(low), float(high)
 
 
+def _mean_or_none(values: Sequence[float]) -> float | None:
+    mean = float(np.mean(values))
+    return None if math.isnan(mean) else mean
+
+
 def summarise(episodes: Sequence[Episode]) -> dict:
     """All figures over some episodes, ready for JSON.
+
+    `spl` and `start_distance` are None where the simulator knows no ways.
 
     Under declared stop there are three more: `declared` and `false_stops`, the shares of episodes
     that the policy ended, and that it ended in vain, and `reached`, the share in which the robot
@@ -88,7 +98,7 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'episodes': len(episodes),
         'success': float(np.mean(success)),
         'success_interval': list(bootstrap_interval(success)),
-        'spl': float(np.mean([path_efficiency(e) for e in episodes])),
+        'spl': _mean_or_none([path_efficiency(e) for e in episodes]),
         'collisions': sum(e.collisions for e in episodes) / max(decisions, 1),
         'contact_free_success': float(np.mean(
             [e.success and e.collisions == 0 for e in episodes])),
@@ -98,7 +108,7 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'decisions_interval': list(bootstrap_interval([e.decisions for e in episodes])),
         'seconds': float(np.mean([e.seconds for e in episodes])),
         'return': float(np.mean([e.reward for e in episodes])),
-        'start_distance': float(np.mean([e.start_distance for e in episodes])),
+        'start_distance': _mean_or_none([e.start_distance for e in episodes]),
     }
     if asked == {True}:
         figures |= {

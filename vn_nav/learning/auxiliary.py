@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from vn_nav.bags.dataset import MAX_DEPTH
 from vn_nav.errors import UserError
 from vn_nav.learning.pixel_change import (
     average_pool_target,
@@ -24,7 +25,6 @@ from vn_nav.learning.returns import masked_mean, n_step_q, n_step_returns
 from vn_nav.learning.rollout import Rollout
 from vn_nav.policy.network import Latents, Policy
 
-MAX_DEPTH = 10.0  # m, white in the depth target
 FAR = 12.0  # m, beyond which distances count as this far
 POSE_OVERLAP = 0.1  # share of the goal picture that must be in view for its pose to count
 WARMTH = 0.5  # decisions: an action that loses so much is a third as likely to be imitated

@@ -22,6 +22,7 @@ from vn_nav.policy.action_filter import make_filter
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
 from vn_nav.policy.zhu import Siamese, check_scenes
+from vn_nav.vector_env import NavigationVectorEnv
 
 
 @dataclasses.dataclass
@@ -83,14 +84,13 @@ class Collector:
     while it acts, and the host waits for the device once a rollout, to read the episodes.
 
     Args:
-        env: a vector environment that observes as `NavigationEnv` does; tensors
-            may change in place with its next step.
+        env: its tensors may change in place with its next step.
         network: the policy; it acts in its `compute_dtype`.
         generator: source of the sampled actions, on the network's device.
         privileged: keys of the environment's `info` to keep beside the observations.
     """
 
-    def __init__(self, env, network: Policy, generator: torch.Generator,
+    def __init__(self, env: NavigationVectorEnv, network: Policy, generator: torch.Generator,
                  privileged: tuple[str, ...] = ()):
         self.env, self.network, self.generator = env, network, generator
         self.privileged = privileged
@@ -235,7 +235,7 @@ class Collector:
         # Never encoded again: not by the learner either.
         seen.extras['features'][t] = self.network.look(seen.image[t])
         if self._scenes > 1:
-            scene = self.env.house_index
+            scene = self.env.place_index
             if self.on_device:
                 scene = scene.cpu().numpy()  # a wait that only these networks pay for
             seen.extras['scene'][t] = self._tensor(check_scenes(scene, self._scenes))

@@ -180,9 +180,8 @@ class Evaluation:
     def _keep(self, row: Row, episodes: list) -> None:
         own = self.measured.setdefault(row.split, {}).setdefault(row.stop, {})
         own[row.name] = episodes
-        graph, rows = self.graphs[row.split], evaluator.figures(self.measured[row.split])
-        self.result['splits'][row.split] = {
-            'houses': [graph.seed], 'rows': rows, 'scenes': {str(graph.seed): rows}}
+        split = evaluator.split_figures(self.measured[row.split], [self.graphs[row.split].name])
+        rows, self.result['splits'][row.split] = split['rows'], split
         write_file(self.folder / 'evaluation.json', json.dumps(self.result, indent=2).encode())
         print(f'{tables.SPLITS[row.split]}, {row.stop} · '
               + tables.row_line(row.name, rows[row.stop][row.name], row.stop), flush=True)
@@ -191,7 +190,7 @@ class Evaluation:
         """Print the tables, write the page; the figures by names, for a checkpoint."""
         for split, entry in self.result['splits'].items():
             tables.print_rows(entry['rows'], f'{self.folder}, {tables.SPLITS[split]}')
-        plans = {name: {graph.seed: graph.floor_plan()} for name, graph in self.graphs.items()}
+        plans = {name: {graph.name: graph.plan()} for name, graph in self.graphs.items()}
         write_file(self.folder / 'evaluation.html',
                    evaluation_page(self.result, self.measured, plans).encode())
         return {f'{split}: {stop}, {name}': figures

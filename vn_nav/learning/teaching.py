@@ -41,6 +41,7 @@ from vn_nav.learning.training import CHECKPOINT, STATE
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.scenes import parse_scene
 
 FOR_A_SPOT = 4  # pictures for each spot that the policy tells apart, at least
 # How the minutes are divided. Reading the bag takes what it takes, but no round of the search for
@@ -201,6 +202,7 @@ class Teaching:
         known = self.given.info['stop_threshold'] if self.given else None
         threshold = known or evaluator.STOP_THRESHOLD
         facts = {'checkpoint': str(self.folder), 'bag': self.bag.name,
+                 'simulator': taught.info['simulator'],
                  'world_version': taught.info['world_version'], 'task': 'image',
                  'max_decisions': DECISIONS}
         graphs = {name: graph for name, graph in self._graphs().items() if graph is not None}
@@ -319,6 +321,7 @@ class Teaching:
         return {
             'camera_fov_deg': math.degrees(self.robot.camera_fov),
             'camera_height': self.robot.camera_height,
+            'simulator': parse_scene(self.graph.name).simulator,
             'world_version': self.graph.world_version, 'preset': PRESET, 'stop_threshold': None,
             'command': self.job.command,
             'data': f'{len(self.graph.poses):,} recorded pictures of {self.bag.name}{part}',

@@ -17,10 +17,11 @@ from vn_nav.learning.log import Log
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.presets import TrainConfig
 from vn_nav.learning.training import CHECKPOINT, Training
+from vn_nav.vector_env import NavigationVectorEnv
 
 
-def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False, info: dict,
-          init: str | Path | None = None,
+def train(env: NavigationVectorEnv, config: TrainConfig, folder: str | Path, *,
+          resume: bool = False, info: dict, init: str | Path | None = None,
           pairs: Callable[[], tuple[PairSource, PairSource]] | None = None,
           bags: BagMix | None = None, on_update: Callable[[dict], None] | None = None) -> Path:
     """Train a policy; SIGINT and SIGTERM save and end it early, cleanly.
@@ -28,9 +29,9 @@ def train(env, config: TrainConfig, folder: str | Path, *, resume: bool = False,
     The folder gets `checkpoint/`, `training_state`, `metrics.csv` and, if asked for,
     `tensorboard/` and `replay/`. A killed training loses what came after the last save, at most
     `config.checkpoint_seconds`. Resumed, it repeats the uninterrupted one bit for bit (one
-    thread, no wall-clock limit) if the environment has `get_state() -> dict of arrays` and
-    `set_state(dict)`, otherwise its episodes begin anew; of a replay memory it lacks the steps
-    that the killed one had overwritten. It says what it found.
+    thread, no wall-clock limit) if the environment is `restorable`, otherwise its episodes begin
+    anew; of a replay memory it lacks the steps that the killed one had overwritten. It says what
+    it found.
 
     Started by torchrun, several processes train one policy (`vn_nav.learning.distributed`):
     frames are those of all, the first one writes the files, and a process that died is replaced

@@ -32,6 +32,7 @@ from vn_nav.learning.training_state import initial_weights, restore, state_of
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.resnet import load_frozen_weights
 from vn_nav.policy.zhu_policy import build_policy
+from vn_nav.vector_env import NavigationVectorEnv
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
@@ -45,8 +46,8 @@ RECENT = 200  # episodes that the shown success, return, length and collisions a
 class Training:
     """Everything that changes while training; `training_state` saves it."""
 
-    def __init__(self, env, config: TrainConfig, folder: Path, info: dict, processes: Processes,
-                 bags: BagMix | None = None):
+    def __init__(self, env: NavigationVectorEnv, config: TrainConfig, folder: Path, info: dict,
+                 processes: Processes, bags: BagMix | None = None):
         torch.set_num_threads(config.threads)
         if bags is not None:
             config = dataclasses.replace(config, extra_heads=(*config.extra_heads, *bags.heads))

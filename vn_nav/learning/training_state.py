@@ -27,7 +27,7 @@ def state_of(training: Training) -> dict:
     """All that changes while a training runs, for a file."""
     replay = training.learner.replay
     env = None  # of many processes each has its own, which nobody saves
-    if hasattr(training.env, 'get_state') and training.processes.count == 1:
+    if training.env.restorable and training.processes.count == 1:
         env = {name: torch.from_numpy(np.array(rows))
                for name, rows in training.env.get_state().items()}
     return {

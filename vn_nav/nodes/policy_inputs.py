@@ -12,6 +12,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 
+from vn_msgs_py.camera import field_of_view
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.decision_worker import WINDOW_S, DecisionWorker
 from vn_nav.nodes.qos import other_types, qos, subscribe
@@ -116,7 +117,7 @@ class PolicyInputs:
         side, focal = min(message.width, message.height), message.k[0]
         if side <= 0 or focal == 0:
             return  # an uncalibrated camera says zero
-        fov = 2 * math.atan(side / 2 / focal)
+        fov = field_of_view(side, side, focal)
         if not CAMERA_FOV[0] <= fov <= CAMERA_FOV[1]:
             least, most = map(math.degrees, CAMERA_FOV)
             self._node.get_logger().error(

@@ -18,6 +18,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Bool, Float32, String, UInt8
 
 from vn_msgs_py import images
+from vn_msgs_py.camera import field_of_view
 from vn_nav.bags.stamped import WINDOW
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.recorded_topics import RecordedTopics
@@ -190,7 +191,7 @@ class Senses:
     def _on_camera_info(self, message: CameraInfo) -> None:
         side, focal = min(message.width, message.height), message.k[0]
         if side > 0 and math.isfinite(focal) and focal > 0:
-            self.camera_fov = 2 * math.atan(side / 2 / focal)
+            self.camera_fov = field_of_view(side, side, focal)
 
     def sees(self) -> bool:
         """Whether there is a picture to decide on, and what belongs beside it."""

@@ -25,7 +25,9 @@ from vn_nav.nodes.robot_senses import BESIDE, Seen
 from vn_nav.nodes.ros_robot import RosRobot
 from vn_nav.reset_arguments import read_options
 from vn_nav.robot import RobotSpec
+from vn_nav.scenes import HOUSE, house_scene
 
+ROBOT = 'robot'  # in place of the name of a simulator
 GOALS = 1024  # different goal pictures of a training
 
 
@@ -115,6 +117,8 @@ class RosEnv:
         for one in self._robots:
             one.connect()
 
+    restorable = False  # a robot is not put back
+
     def __enter__(self) -> RosEnv:
         return self
 
@@ -138,6 +142,24 @@ class RosEnv:
     def scene(self) -> dict:
         """What the first robot's simulator says of its house; empty: there is none."""
         return self._robots[0].scene
+
+    @property
+    def simulator_name(self) -> str:
+        """Of the simulator behind the topics, as `vn_nav.scenes` names it; ROBOT: there is none.
+
+        Bridges of earlier versions simulated houses alone, and did not say so.
+        """
+        said = {one.scene.get('simulator', HOUSE if 'house' in one.scene else ROBOT)
+                for one in self._robots}
+        return said.pop() if len(said) == 1 else ROBOT
+
+    @property
+    def scene_names(self) -> list[str]:
+        """Of the first robot's scene; empty: nobody says."""
+        scene = self.scene
+        if isinstance(scene.get('scene'), str):
+            return [scene['scene']]
+        return [house_scene(scene['house'], scene.get('rooms'))] if 'house' in scene else []
 
     @property
     def world_version(self) -> str:

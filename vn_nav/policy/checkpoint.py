@@ -218,12 +218,11 @@ def _check_weights(weights: bytes, wanted: dict[str, tuple], where: str
 def model_card(config: dict, parameters: int, size: int) -> str:
     """The README of a checkpoint, from the content of its `config.json`."""
     network = config['network']
-    side, houses = network['size'], config['houses']
+    side, scenes = network['size'], config['scenes']
     home = 'its training environment'
-    if houses:
-        home = f'{len(houses)} procedural house{"s" * (len(houses) > 1)} ' + (
-            f'(seed{"s" * (len(houses) > 1)} {", ".join(map(str, houses[:8]))}'
-            f'{", ..." * (len(houses) > 8)}; {config["rooms"]} rooms each)')
+    if scenes:
+        home = (f'{len(scenes)} scene{"s" * (len(scenes) > 1)} ({", ".join(scenes[:8])}'
+                f'{", ..." * (len(scenes) > 8)})')
     facts = {
         'Input': f'RGB {side} x {side} from a camera {config["camera_height"]:g} m above the '
                  f'floor, {config["camera_fov_deg"]:g} deg field of view; the goal picture alike',

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vn_nav.errors import UserError
+from vn_nav.scenes import HOUSE, house_scene
 from vn_nav.structured_file import read_json
 
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
@@ -20,12 +21,12 @@ DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
 # What a checkpoint says beside its weights, and what it says when nobody told it.
 INFO: dict[str, Any] = {
-    'world_version': REQUIRED,  # of the simulator's pixels, houses and motion
+    'world_version': REQUIRED,  # of the simulator's pixels, places and motion
     'camera_fov_deg': REQUIRED,  # of the square picture
     'camera_height': REQUIRED,  # m above the floor
     'decoding': 'sample',  # the rule that `results` were measured with
-    'houses': [],  # seeds
-    'rooms': None,  # of each house
+    'simulator': HOUSE,  # that it was trained in, see `vn_sim_bridge.simulators`
+    'scenes': [],  # names, see `vn_nav.scenes`
     'task': 'image',  # what it was trained for
     'objects': 1,  # in the house at a time
     'randomisation': 'none',  # of light, camera and base: a name, or a file's path
@@ -58,7 +59,7 @@ INFO_TYPES = {
     'world_version': Rule(TEXT), 'decoding': Rule(TEXT), 'task': Rule(TEXT),
     'randomisation': Rule(TEXT), 'preset': Rule(TEXT), 'command': Rule(TEXT),
     'notes': Rule(TEXT), 'results': Rule((dict,)), 'data': Rule(TEXT), 'losses': Rule(LIST),
-    'houses': Rule(LIST), 'rooms': Rule(INTEGER, 1, 1000), 'objects': Rule(INTEGER, 0, 1000),
+    'scenes': Rule(LIST), 'simulator': Rule(TEXT), 'objects': Rule(INTEGER, 0, 1000),
     'goals_per_room': Rule(INTEGER, 1, 1000), 'goal_variants': Rule(INTEGER, 1, 1000),
     'stop_threshold': Rule(NUMBER, 0, 1), 'seed': Rule(INTEGER, -2**63, 2**64),
     'frames': Rule(INTEGER, 0, 2**63), 'minutes': Rule(NUMBER, 0, 1e9),
@@ -114,6 +115,7 @@ def check_info(info: dict, where: str) -> dict:
     Raises:
         UserError: a missing or unknown key, or a value of a wrong type or size.
     """
+    info = _named_scenes(info, where)
     unknown = sorted(info.keys() - INFO.keys())
     if unknown:
         raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} beside the network',
@@ -131,13 +133,25 @@ def check_info(info: dict, where: str) -> dict:
     return full
 
 
+def _named_scenes(info: dict, where: str) -> dict:
+    """The same, with names in place of the seeds of houses that earlier versions wrote."""
+    if 'houses' not in info:
+        return {key: value for key, value in info.items() if key != 'rooms'}
+    houses, rooms = info['houses'], info.get('rooms')
+    numbers = [*houses, rooms or 1] if isinstance(houses, (list, tuple)) else [None]
+    if not all(type(number) is int and 0 <= number < 2**63 for number in numbers):
+        raise UserError('houses is a list of seeds, and rooms their number', reprlib.repr(
+            (houses, rooms)), f'correct {where}')
+    return {**{key: value for key, value in info.items() if key not in ('houses', 'rooms')},
+            'scenes': [house_scene(seed, rooms) for seed in houses]}
+
+
 def _check_entry(key: str, value: object, where: str) -> None:
     """Raise a `UserError` for a value of another type than its key's, or out of its range."""
     rule = INFO_TYPES[key]
     kept = isinstance(value, rule.types) and not isinstance(value, bool)
     if kept and isinstance(value, LIST):
-        item = {'houses': int, 'losses': str}[key]
-        kept = all(isinstance(one, item) and not isinstance(one, bool) for one in value)
+        kept = all(isinstance(one, str) for one in value)
     if not kept:
         names = ' or '.join(kind.__name__ for kind in rule.types)
         raise UserError(f'{key} is {names}', reprlib.repr(value), f'correct {where}')

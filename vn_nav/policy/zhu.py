@@ -133,20 +133,20 @@ def check_scenes(scene: np.ndarray, scenes: int) -> np.ndarray:
     unknown = scene[(scene < 0) | (scene >= scenes)]
     if len(unknown):
         raise UserError(f'the network has layers for {scenes} scenes, numbered from 0',
-                        f'scene {unknown[0]}', 'use it in the houses that it was trained in, or '
-                        'train one with as many scenes as there are houses')
+                        f'scene {unknown[0]}', 'use it in the scenes that it was trained in, or '
+                        'train one with as many scenes')
     return scene
 
 
-def scene_numbers(houses: Sequence[int], known: Sequence[int]) -> np.ndarray:
-    """Numbers [N] of the scenes that houses are, by the seeds that a network was trained in.
+def scene_numbers(scenes: Sequence[str], known: Sequence[str]) -> np.ndarray:
+    """Numbers [N] of scenes, by the names of those that a network was trained in.
 
     Raises:
-        UserError: a house that the network was not trained in.
+        UserError: a scene that the network was not trained in.
     """
-    for seed in houses:
-        if seed not in known:
-            raise UserError('a network with layers for several scenes knows the houses '
-                            f'{", ".join(map(str, known))} alone', f'house {seed}',
+    for scene in scenes:
+        if scene not in known:
+            raise UserError('a network with layers for several scenes knows the scenes '
+                            f'{", ".join(known)} alone', scene,
                             'evaluate it there, or train one with a single scene')
-    return np.array([list(known).index(seed) for seed in houses], np.int64)
+    return np.array([list(known).index(scene) for scene in scenes], np.int64)

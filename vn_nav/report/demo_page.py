@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vn_nav import __version__
+from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
 from vn_nav.evaluation.metrics import Episode, path_efficiency
 from vn_nav.report.maps import Journey, floor_map
@@ -35,9 +36,9 @@ policy were two processes that met on ROS topics alone. The policy saw the camer
 and its own last action; no map, no pose, no depth.</p>
 {body}
 <h2>What the words mean</h2><dl>{_declared_stop(result['trained'])}
-<dt>Success</dt><dd>At the end of a decision the robot stands within 0.6 m of the place (driving
-distance) and faces within 30 degrees of the picture's direction. In brackets the 95 %
-interval.</dd>
+<dt>Success</dt><dd>At the end of a decision the robot stands within {ARRIVAL_RADIUS:g} m of the
+place (driving distance) and faces within {math.degrees(ARRIVAL_HEADING):g} degrees of the
+picture's direction. In brackets the 95 % interval.</dd>
 <dt>SPL</dt><dd>Success weighted by path length: 1 means that every journey succeeded on the
 shortest way.</dd>
 <dt>Collisions</dt><dd>Share of decisions that touched something. The robot does not slide along
@@ -80,8 +81,9 @@ def _place(place: str, drive: Drive, figures: dict) -> str:
     stop = ' Declared stop.' if stops else ''
     limit = '' if place == 'trained' else (
         f' Episodes end at {figures["max_decisions"]} decisions here.')
+    name = html.escape(scene.get('scene') or f'House {scene["house"]}')
     return f"""<h2>{TITLES[place]}</h2>
-<p class="soft">House {scene['house']}: {len(scene['rooms_list'])} rooms, {scene['area']:.0f}
+<p class="soft">{name}: {len(scene['rooms_list'])} rooms, {scene['area']:.0f}
 m&sup2;, {figures['episodes']} episodes, mean start distance
 {figures['start_distance']:.1f} m.{stop}{limit}</p>
 {boxes}

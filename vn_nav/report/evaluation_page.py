@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from vn_nav import __version__
+from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.evaluation.evaluator import ARRIVAL, BLANK, DECLARED, RANDOM, WRONG, Rows
 from vn_nav.evaluation.metrics import Episode
 from vn_nav.report.maps import Journey, floor_map
 from vn_nav.report.page import cards, page
-from vn_nav.report.tables import SPLITS, TITLES, rows_html, scenes_html
+from vn_nav.report.tables import SPLITS, TITLES, number, rows_html, scenes_html
 
 MAPS = 6  # of a split, unless the user asks for another number
-WORDS = """<h2>What the words mean</h2><dl>
+WORDS = f"""<h2>What the words mean</h2><dl>
 <dt>Arrival</dt><dd>The simulator ends an episode as soon as the robot stands, at the end of a
-decision, within 0.6 m of the goal (driving distance) and faces within 30 degrees of the picture's
+decision, within {ARRIVAL_RADIUS:g} m of the goal (driving distance) and faces within
+{math.degrees(ARRIVAL_HEADING):g} degrees of the picture's
 direction. That is success. (Other tasks than pictures of places have rules of their own.)</dd>
 <dt>Declared stop</dt><dd>The robot has to say that it has arrived. Success needs arrival at that
 moment; a false stop ends the episode. <i>Declared</i> and <i>false stops</i> are shares of
@@ -31,18 +36,18 @@ offset an action (what led nowhere from there is blocked, and after much turning
 pushed); share at which another action came out than without it.</dd>
 <dt>Stop error</dt><dd>Distance and angle to the goal at the end of all episodes.</dd>
 <dt>Wrong goal, blank goal</dt><dd>The same policy on the same starts, but shown the picture of
-another place in the house, or plain grey; it is still measured at the right place. A policy that
+another goal of the scene, or plain grey; it is still measured at the right place. A policy that
 looks at its picture falls far behind here.</dd></dl>"""
 
 
 def evaluation_page(result: dict, measured: dict[str, Rows],
-                    plans: dict[str, dict[int, dict]], *, maps: int = MAPS) -> str:
+                    plans: dict[str, dict[str, dict]], *, maps: int = MAPS) -> str:
     """The page.
 
     Args:
         result: as `vn_nav evaluate --json` writes it.
         measured: the episodes behind it, by split.
-        plans: floor plans by split and the house's seed, see `floor_map`.
+        plans: floor plans by split and scene; None: there is none, see `floor_map`.
         maps: at most this many of each split.
     """
     body = ''.join(_split(name, split, measured[name], plans[name], result, maps)
@@ -56,29 +61,30 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
 {WORDS}""")
 
 
-def _split(name: str, split: dict, rows: Rows, plans: dict[int, dict], result: dict,
+def _split(name: str, split: dict, rows: Rows, plans: dict[str, dict | None], result: dict,
            maps: int) -> str:
     # The headline is the declared stop, where the policy can declare one.
     headline = DECLARED if DECLARED in split['rows'] else ARRIVAL
     tables = ''.join(f'<h3>{TITLES[stop]}</h3>{rows_html(own, stop)}'
                      for stop, own in split['rows'].items())
-    scenes = ''.join(f'<h3>{TITLES[stop]}</h3>{scenes_html(split["scenes"], stop)}'
-                     for stop in split['rows'])
-    bag, limit, houses = result.get('bag'), result['max_decisions'], len(split['houses'])
-    scenes = '' if bag else f'<details><summary>By house</summary>{scenes}</details>'
-    where = f'{houses} house{"s" * (houses > 1)}' if bag is None else (
+    bag, limit, scenes = result.get('bag'), result['max_decisions'], len(split['scenes'])
+    each = ''.join(f'<h3>{TITLES[stop]}</h3>{scenes_html(split["scenes"], stop)}'
+                   for stop in split['rows'])
+    each = '' if bag else f'<details><summary>By scene</summary>{each}</details>'
+    where = f'{scenes} scene{"s" * (scenes > 1)}' if bag is None else (
         f'In the pictures of the drive {html.escape(bag)}')
     own = next(iter(split['rows'][headline].values()))
     chosen = choose(next(iter(rows[headline].values())), maps)
-    figures = ''.join(_map(episode, plans[episode.scene], limit, bag) for episode in chosen)
+    figures = ''.join(_map(episode, plans[episode.scene], limit, bag) for episode in chosen
+                      if plans[episode.scene] is not None)
     legend = ('<p class="soft">Dot: start; ring: end; blue arrow: the goal and where its picture '
               'looks; crosses: contacts.</p>' if chosen else '')
     return f"""<h2>{html.escape(SPLITS.get(name, name))}</h2>
 <p class="soft">{where}, {own['episodes']} episodes a row, mean start
-distance {own['start_distance']:.1f} m.</p>
+distance {number(own['start_distance'], '.1f')} m.</p>
 {_cards(split['rows'][headline], headline)}
 {tables}
-{scenes}
+{each}
 {legend}<div class="maps">{figures}</div>"""
 
 
@@ -86,13 +92,13 @@ def _cards(rows: dict[str, dict], stop: str) -> str:
     own = next(iter(rows.values()))
 
     def beside(key: str, words: str) -> str:
-        return '; '.join(f'{name} {rows[name][key]:{words}}' for name in (WRONG, BLANK, RANDOM)
-                         if name in rows)
+        return '; '.join(f'{name} {number(rows[name][key], words)}'
+                         for name in (WRONG, BLANK, RANDOM) if name in rows)
     low, high = own['success_interval']
     entries = [
         (f'{own["success"]:.0%}', f'success, {TITLES[stop].lower()} ({low:.0%} to {high:.0%})',
          beside('success', '.0%')),
-        (f'{own["spl"]:.2f}', 'SPL', beside('spl', '.2f')),
+        (number(own['spl'], '.2f'), 'SPL', beside('spl', '.2f')),
         (f'{own["collisions"]:.1%}', 'decisions with a collision',
          f'{own["contact_free_success"]:.0%} succeeded without any'),
         (f'{own["decisions"]:.0f}', 'decisions an episode', f'{own["seconds"]:.0f} s of driving'),
@@ -111,9 +117,9 @@ def choose(episodes: Sequence[Episode], count: int) -> list[Episode]:
         count: how many at most.
     """
     def spread(kind: bool) -> list[Episode]:
-        seen: dict[int, int] = {}
+        seen: dict[str, int] = {}
         ranked = []
-        for e in sorted(episodes, key=lambda e: -e.start_distance):
+        for e in sorted(episodes, key=lambda e: -np.nan_to_num(e.start_distance)):
             if e.success == kind:
                 ranked.append((seen.get(e.scene, 0), e))
                 seen[e.scene] = seen.get(e.scene, 0) + 1
@@ -142,8 +148,10 @@ def _map(episode: Episode, plan: dict, limit: int, bag: str | None) -> str:
     count = episode.decisions
     after = (f'after {count} decision{"s" * (count > 1)}' if count < limit
              else f'at the limit of {limit} decisions')
-    to = 'To the' if bag else f'House {episode.scene}, to the'
+    to = 'To the' if bag else f'{html.escape(episode.scene)}, to the'
+    shortest = ('' if math.isnan(episode.start_distance) else
+                f' for a shortest way of {episode.start_distance:.1f} m')
     return f"""<figure>{drawn}<figcaption>{to}
 {html.escape(episode.goal)}: <span class="{kind}">{outcome(episode)}</span> {after},
-{episode.path_length:.1f} m for a shortest way of {episode.start_distance:.1f} m; end
+{episode.path_length:.1f} m{shortest}; end
 {episode.stop_distance:.1f} m from the goal</figcaption></figure>"""

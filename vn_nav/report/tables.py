@@ -11,7 +11,7 @@ from vn_nav.report.terminal import print_table
 
 TITLES = {'arrival': 'Arrival', 'declared': 'Declared stop'}
 SPLITS = {  # names of splits, for people
-    'houses': 'Chosen houses', 'seen_goals': 'Seen goals', 'unseen_goals': 'Unseen goals',
+    'scenes': 'Chosen scenes', 'seen_goals': 'Seen goals', 'unseen_goals': 'Unseen goals',
     'all_goals': 'All goals',
     'train': 'Training split', 'validation': 'Validation split', 'test': 'Test split',
     'unseen_look': 'Unseen look',
@@ -20,7 +20,7 @@ Column = tuple[str, Callable[[dict], str]]  # heading, its words from a summary
 COLUMNS: tuple[Column, ...] = (
     ('success (95 %)', lambda r: '{:.2f} ({:.2f}-{:.2f})'.format(r['success'],
                                                                  *r['success_interval'])),
-    ('SPL', lambda r: f'{r["spl"]:.2f}'),
+    ('SPL', lambda r: number(r['spl'], '.2f')),
     ('decisions (95 %)', lambda r: '{:.0f} ({:.0f}-{:.0f})'.format(r['decisions'],
                                                                    *r['decisions_interval'])),
     ('seconds', lambda r: f'{r["seconds"]:.0f}'),
@@ -42,13 +42,18 @@ FILTER_COLUMNS: tuple[Column, ...] = (  # where a row has an action filter
 )
 
 
-def place(split: str, houses: Sequence[int], bag: str | None = None) -> str:
-    """A split and its houses, or the recorded drive, in a few words."""
+def number(value: float | None, form: str) -> str:
+    """A figure, or a dash where there is none."""
+    return '-' if value is None else f'{value:{form}}'
+
+
+def place(split: str, scenes: Sequence[str], bag: str | None = None) -> str:
+    """A split and its scenes, or the recorded drive, in a few words."""
     if bag is not None:
         return f'{SPLITS[split].lower()} of {bag}'
-    if len(houses) <= 3:
-        return f'{SPLITS[split].lower()} (house {", ".join(map(str, houses))})'
-    return f'{SPLITS[split].lower()} ({len(houses)} houses)'
+    if len(scenes) <= 3:
+        return f'{SPLITS[split].lower()} ({", ".join(scenes)})'
+    return f'{SPLITS[split].lower()} ({len(scenes)} scenes)'
 
 
 def _columns(stop: str, rows: Iterable[dict]) -> tuple[Column, ...]:
@@ -63,15 +68,15 @@ def _rows_cells(rows: dict[str, dict], stop: str) -> tuple[list[str], list[list[
 
 
 def _scenes_cells(scenes: dict, stop: str) -> tuple[list[str], list[list[str]]]:
-    """A line a house: the policy's figures, and beside them the success of each control."""
+    """A line a scene: the policy's figures, and beside them the success of each control."""
     columns = _columns(stop, (row for rows in scenes.values() for row in rows[stop].values()))
     names = list(next(iter(scenes.values()))[stop])
     lines = []
-    for seed, rows in scenes.items():
+    for scene, rows in scenes.items():
         own, *controls = rows[stop].values()
-        lines.append([str(seed), str(own['episodes']), *(words(own) for _, words in columns),
+        lines.append([scene, str(own['episodes']), *(words(own) for _, words in columns),
                       *(f'{control["success"]:.2f}' for control in controls)])
-    return ['house', 'episodes', *(heading for heading, _ in columns), *names[1:]], lines
+    return ['scene', 'episodes', *(heading for heading, _ in columns), *names[1:]], lines
 
 
 def row_line(name: str, figures: dict, stop: str) -> str:
@@ -93,9 +98,9 @@ def print_rows(figures: dict[str, dict[str, dict]], title: str) -> None:
 
 
 def print_scenes(scenes: dict, title: str) -> None:
-    """Print the figures of each house; `scenes` by seed, each as for `print_rows`."""
+    """Print the figures of each scene; `scenes` by name, each as for `print_rows`."""
     for stop in next(iter(scenes.values())):
-        _print(f'{title}: {TITLES[stop].lower()}, by house', *_scenes_cells(scenes, stop))
+        _print(f'{title}: {TITLES[stop].lower()}, by scene', *_scenes_cells(scenes, stop))
 
 
 def _print(title: str, headings: list[str], lines: list[list[str]]) -> None:
@@ -111,5 +116,6 @@ def rows_html(rows: dict[str, dict], stop: str) -> str:
 
 
 def scenes_html(scenes: dict, stop: str) -> str:
-    """The figures of each house, of one kind of stop, as an HTML table."""
-    return table(*_scenes_cells(scenes, stop))
+    """The figures of each scene, of one kind of stop, as an HTML table."""
+    headings, lines = _scenes_cells(scenes, stop)
+    return table(headings, [[html.escape(cell) for cell in line] for line in lines])

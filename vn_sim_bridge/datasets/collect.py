@@ -22,13 +22,14 @@ from vn_msgs_py.motion import yaw_to_quaternion
 from vn_msgs_py.topics import Topic, topic
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
+from vn_nav.scenes import HOUSE, parse_scene
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.datasets.house_pairs import PairSampler
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.render.randomisation import Randomisation
-from vn_sim_bridge.simulator import Backend, Frames
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulator import Frames, Simulator
+from vn_sim_bridge.simulators.house import HouseSimulator, open_houses
 
 VIEWS = 8  # pictures of a group
 GROUPS = 8  # that are drawn at a time
@@ -47,7 +48,7 @@ class Scene(Protocol):
 
     facts: dict  # for the topic `scene`, JSON
     label_names: Sequence[str]  # behind the class ids
-    backend: Backend
+    simulator: Simulator
 
     def look(self, number: int, groups: int) -> tuple[np.ndarray, Frames]:
         """Poses [groups * VIEWS,4] of the groups from a number on, and what is seen there."""
@@ -82,11 +83,12 @@ class HouseScene:
         self._sampler = PairSampler((seed,), rooms=rooms, size=size, robot=robot, seed=draws)
         self._draws = draws
         house, = self._sampler.houses
-        self.backend = HouseBackend([house], np.zeros(GROUPS * VIEWS, np.int64), robot=robot,
-                                    size=size, threads=threads, randomisation=randomisation)
+        self.simulator = HouseSimulator([house], np.zeros(GROUPS * VIEWS, np.int64), robot=robot,
+                                        size=size, threads=threads, randomisation=randomisation)
         self.facts = {
-            'world_version': self.backend.world_version, 'rooms': len(house.rooms),
-            **house.floor_plan(),
+            'simulator': HOUSE, 'world_version': self.simulator.version,
+            'rooms': len(house.rooms),
+            **house.plan(),
             'arrival': {'radius': tasks.ARRIVAL_RADIUS,
                         'heading_deg': math.degrees(tasks.ARRIVAL_HEADING)},
             'camera_fov_deg': math.degrees(robot.camera_fov)}
@@ -100,17 +102,27 @@ class HouseScene:
         poses = poses.reshape(-1, 4)
         views = number * VIEWS + np.arange(groups * VIEWS)
         robots = np.arange(groups * VIEWS)
-        self.backend.place(robots, poses)
-        self.backend.dress(robots, self._draws, Stream.PAIR_APPEARANCE, views, COLLECTED)
-        return poses, self.backend.observe(
+        self.simulator.place(robots, poses)
+        self.simulator.apply_appearance(robots, self._draws, Stream.PAIR_APPEARANCE, views,
+                                        COLLECTED)
+        return poses, self.simulator.observe(
             robots, key(self._draws, Stream.PAIR_SENSOR, views, COLLECTED))
 
 
-def house_scenes(houses: Iterable[int], rooms: int, size: int, robot: RobotSpec,
+def house_scenes(scenes: Iterable[str], size: int, robot: RobotSpec,
                  randomisation: Randomisation, seed: int, threads: int) -> Iterator[HouseScene]:
-    """The scenes of some houses by their seeds, made one at a time."""
-    for house in houses:
-        yield HouseScene(house, rooms, size, robot, randomisation, seed, threads)
+    """What is seen in some scenes, by their names, made one at a time.
+
+    Raises:
+        UserError: a scene that is no house.
+    """
+    for scene in scenes:
+        parts = parse_scene(scene)
+        if parts.simulator != HOUSE:
+            raise UserError('pictures are collected in embedded houses', scene,
+                            'name houses, as in house:7')
+        house, = open_houses([parts])
+        yield HouseScene(house.seed, len(house.rooms), size, robot, randomisation, seed, threads)
 
 
 class Collected(NamedTuple):
@@ -144,7 +156,7 @@ def collect(scenes: Iterable[Scene], count: int, pictures: int, robot: RobotSpec
                         f'{pictures} pictures of {count} scenes', 'collect more pictures')
     scenes = iter(scenes)
     first = next(scenes)
-    can = first.backend.capabilities
+    can = first.simulator.capabilities
     names = ['image_raw', 'camera_info', 'odom', 'episode_end', 'scene',
              *['depth/image_raw'] * can.depth, *['labels/image_raw', 'labels/names'] * can.labels]
     with open_bag([topic(name) for name in names]) as writer:

@@ -12,12 +12,13 @@ from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
-from vn_sim_bridge.houses.house import CELL, DistanceField, FloorMap
+from vn_sim_bridge.floor.distance import FloorDistance
+from vn_sim_bridge.floor.floor_map import CELL, FloorMap
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.simulator import Frames
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulators.house import HouseSimulator
 
 # How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.
 NEARBY = (0.30, 4.0, math.radians(75))
@@ -57,8 +58,8 @@ class PairSampler:
         self.houses = [generate_house(house, rooms=rooms) for house in houses]
         self.count = 0  # pairs drawn so far
         self._seed, self._size = seed, size
-        self._backend = HouseBackend(self.houses, [0], robot=robot or RobotSpec(), size=size,
-                                     threads=threads, randomisation=randomisation)
+        self._simulator = HouseSimulator(self.houses, [0], robot=robot or RobotSpec(), size=size,
+                                         threads=threads, randomisation=randomisation)
         cells = [house.floor.centres() for house in self.houses]
         maps = [house.floor.free for house in self.houses]
         free = np.zeros((len(maps), *np.max([part.shape for part in maps], axis=0)), bool)
@@ -69,7 +70,7 @@ class PairSampler:
             np.concatenate(cells), np.cumsum([0, *map(len, cells)]),
             np.concatenate(rects), np.cumsum([0, *map(len, rects)]), free,
             np.array([house.floor.origin for house in self.houses]),
-            self._backend.robot.footprint_radius)
+            self._simulator.robot.footprint_radius)
 
     def draw(self, count: int) -> dict[str, np.ndarray]:
         """The next pairs.
@@ -173,17 +174,17 @@ class PairSampler:
             window = FloorMap(
                 (floor.origin[0] + left * CELL, floor.origin[1] + low * CELL),
                 np.ascontiguousarray(floor.free[low:row + WINDOW + 1, left:column + WINDOW + 1]))
-            field = DistanceField(window, *goal_poses[k, :2])
-            distance[k] = field.distance(poses[k:k + 1, :2])[0]
+            field = FloorDistance(window, *goal_poses[k, :2])
+            distance[k] = field.at(poses[k:k + 1, :2])[0]
         return tasks.arrived(distance, error)
 
     def _look(self, house, poses, numbers, view: int | np.ndarray
               ) -> tuple[Frames, tuple]:
         """Pictures from poses, and the cameras that took them; `view` tells the two apart."""
-        appearance = self._backend.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
-        frames = self._backend.view(house, poses, None, appearance,
-                                    key(self._seed, Stream.PAIR_SENSOR, numbers, view))
-        return frames, self._backend.cameras(poses, appearance)
+        appearance = self._simulator.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
+        frames = self._simulator.view(house, poses, None, appearance,
+                                      key(self._seed, Stream.PAIR_SENSOR, numbers, view))
+        return frames, self._simulator.cameras(poses, appearance)
 
 
 @numba.njit(cache=True)

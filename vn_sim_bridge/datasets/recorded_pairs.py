@@ -81,7 +81,7 @@ class GraphPairs:
     def _overlap(self, nodes, poses, first, second) -> np.ndarray:
         graph = self._graph
         if graph.depth is None:
-            return graph.overlap(poses[first], poses[second], self._robot.camera_fov)
+            return graph.co_visibility(poses[first], poses[second], self._robot.camera_fov)
         depth = graph.depth[nodes].astype(np.float32)
         cameras, fov = cameras_at(graph.poses[nodes], self._robot)
         points = lift(depth, cameras, fov)

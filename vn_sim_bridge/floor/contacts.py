@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numba
 import numpy as np
 
 from vn_nav.robot import RobotSpec
-from vn_sim_bridge.houses.house import House
-
-# Pixels, houses and motion together. Whoever changes one of them raises it and trains the shipped
-# models again: a checkpoint is only worth its figures in the world that it was measured in.
-WORLD_VERSION = '2'
+from vn_sim_bridge.simulator import Place
 
 TRANSLATION_NOISE = 0.02  # m per decision, standard deviation along the movement (thesis, 5.6)
 ROTATION_NOISE = math.radians(2.0)  # rad per decision (thesis, 5.7)
@@ -22,20 +19,20 @@ PRECISION = 1e-4  # m, to which a contact is located
 
 
 class World:
-    """Poses of N robots, each in one of several houses.
+    """Poses of N robots, each in one of several places with `obstacle_rects`.
 
     Args:
-        houses: the houses.
-        house_index: [N] the house of each robot.
+        places: houses, for instance.
+        place_index: [N] the place of each robot.
         radius: footprint radius of the robots [m].
     """
 
-    def __init__(self, houses: list[House], house_index: np.ndarray, radius: float):
-        self.house_index = np.array(house_index, np.int64)
+    def __init__(self, places: Sequence[Place], place_index: np.ndarray, radius: float):
+        self.place_index = np.array(place_index, np.int64)
         self.radius = radius
-        self.poses = np.zeros((len(self.house_index), 4))  # x, y, yaw, pitch
-        self._rects = np.concatenate([house.obstacle_rects for house in houses])
-        self._first = np.cumsum([0] + [len(house.obstacle_rects) for house in houses])
+        self.poses = np.zeros((len(self.place_index), 4))  # x, y, yaw, pitch
+        self._rects = np.concatenate([place.obstacle_rects for place in places])
+        self._first = np.cumsum([0] + [len(place.obstacle_rects) for place in places])
 
     def move(self, delta: np.ndarray, env_ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Displace robots in their own frames; a translation ends where it would touch something.
@@ -51,12 +48,12 @@ class World:
         done = np.empty((len(env_ids), 4))
         touched = np.zeros(len(env_ids), bool)
         _move(self.poses, np.asarray(env_ids, np.int64), np.ascontiguousarray(delta, float),
-              self.house_index, self._first, self._rects, self.radius, done, touched)
+              self.place_index, self._first, self._rects, self.radius, done, touched)
         return done, touched
 
     def reach(self, env_id: int, headings: np.ndarray, length: float) -> np.ndarray:
         """Where a translation of `length` [m] along each heading [rad] would end, [K,2] m."""
-        house = self.house_index[env_id]
+        house = self.place_index[env_id]
         rects = self._rects[self._first[house]:self._first[house + 1]]
         return _reach(self.poses[env_id, 0], self.poses[env_id, 1], headings, length, rects,
                       self.radius)

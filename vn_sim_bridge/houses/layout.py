@@ -7,23 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vn_sim_bridge.floor.floor_map import Rect
+
 WALL = 0.12  # m, thickness of inner and outer walls
 DOOR_WIDTH = 0.95  # m
 MIN_SIDE = 2.9  # m, least side of a room between wall centres
-
-
-class Rect(NamedTuple):
-    """An axis-aligned rectangle [m]."""
-
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-
-    @property
-    def area(self) -> float:
-        """In square metres."""
-        return (self.x1 - self.x0) * (self.y1 - self.y0)
 
 
 class Door(NamedTuple):

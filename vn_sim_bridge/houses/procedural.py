@@ -5,19 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.houses.bake import light_baker
-from vn_sim_bridge.houses.furniture import KINDS, OPTIONAL_PROBABILITY, ROOM_PROGRAMMES, TALL
-from vn_sim_bridge.houses.house import (
+from vn_nav.scenes import house_scene
+from vn_sim_bridge.floor.floor_map import (
     FREE_MARGIN,
-    Goal,
-    House,
-    Obstacle,
-    Room,
     clearance,
     floor_map,
     grid_of,
     main_component,
 )
+from vn_sim_bridge.houses.bake import light_baker
+from vn_sim_bridge.houses.furniture import KINDS, OPTIONAL_PROBABILITY, ROOM_PROGRAMMES, TALL
+from vn_sim_bridge.houses.house import House, Obstacle, Room
 from vn_sim_bridge.houses.labels import LABEL
 from vn_sim_bridge.houses.layout import (
     WALL,
@@ -35,6 +33,7 @@ from vn_sim_bridge.houses.splits import look_of
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
 from vn_sim_bridge.houses.viewpoints import choose_goals
 from vn_sim_bridge.render.scene import SceneBuilder
+from vn_sim_bridge.simulator import Goal
 
 HEIGHT = 2.6  # m, of rooms
 DOOR_HEIGHT = 2.05  # m
@@ -125,7 +124,7 @@ class _Construction:
         floor = floor_map(self.outline, np.array([o.rect for o in self.obstacles]),
                           FOOTPRINT_RADIUS)
         goals = choose_goals(scene, self.rooms, floor, goal_rng, goals_per_room)
-        return House(f'house-{self.seed}-{len(self.rooms)}', self.seed, self.outline, scene,
+        return House(house_scene(self.seed, len(self.rooms)), self.seed, self.outline, scene,
                      tuple(self.rooms), tuple(self.obstacles),
                      tuple(Goal(pose, room) for pose, room in goals), FOOTPRINT_RADIUS)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -16,90 +15,27 @@ from gymnasium.vector.utils import batch_space
 from vn_nav.co_visibility import GRID, co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.reset_arguments import are_several, read_options, read_seed, read_seeds
-from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.robot import RobotSpec
+from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.floor.contacts import motion_noise
-from vn_sim_bridge.houses.house import CELL, interpolate
-from vn_sim_bridge.houses.objects import GOAL_OBJECTS
-from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.floor.floor_map import CELL
 from vn_sim_bridge.navigation import tasks
+from vn_sim_bridge.navigation.env_config import EnvConfig, check_simulator
+from vn_sim_bridge.navigation.episodes import draw_grip, draw_motion_scale, draw_variant
 from vn_sim_bridge.navigation.explorer import Explorer
+from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
 from vn_sim_bridge.navigation.oracle import FloorOracle, turning_table
 from vn_sim_bridge.navigation.tasks import BLANK, RIGHT, WRONG
-from vn_sim_bridge.render.randomisation import Randomisation, load_randomisation
-from vn_sim_bridge.simulator import Frames, Simulator
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulator import Frames, Motion, Setup, Simulator
+from vn_sim_bridge.simulators import open_simulator
 
-TASKS = ('image', 'object', 'room', 'collect')
-PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
-              'overlap', 'explorer_action', 'oracle_regret')
-STOPS = ('arrival', 'declared')
 SQUARE = 1.0  # m, side of the squares of floor that exploration counts
 BATCH = 256  # goal pictures drawn at a time: few need little memory
 
 
-@dataclasses.dataclass(frozen=True)
-class EnvConfig:
-    """What a `NavigationEnv` simulates.
-
-    Environment i lives in house i modulo their number. With more houses than environments it draws
-    one of the houses i, i + N, i + 2 N, ... for every episode.
-    """
-
-    houses: tuple[int, ...] = (0,)  # seeds
-    rooms: int = 5  # of each house
-    num_envs: int = 64
-    size: int = 84  # pixels
-    actions: tuple[str, ...] = DRIVE_ACTIONS
-    max_decisions: int = 300
-    noise: bool = True
-    progress_reward: float = 0.0  # per metre of geodesic progress
-    collision_reward: float = 0.0  # per decision that touched something; a penalty is negative
-    step_reward: float = 0.0  # per decision that does not reach the goal; a penalty is negative
-    goal_bonus: float = 0.0  # at the goal, beside the sparse reward
-    min_start_distance: float = 1.0  # m, geodesic
-    one_goal_per_env: bool = False  # environment i keeps pair i; else drawn each episode
-    seed: int = 0
-    goals_per_room: int = 1
-    task: str = 'image'  # of TASKS
-    objects: int = 1  # in the house at a time (object, collect)
-    room_must_see: bool = False  # the room rule of House3D's code, see tasks.RoomGoal
-    randomisation: Randomisation = Randomisation()
-    privileged: tuple[str, ...] = ()  # of PRIVILEGED
-    stop: str = 'arrival'  # of STOPS: an episode ends on arrival, or when the robot says so
-    goal_variants: int | None = None  # pictures of each goal; default: the randomisation's
-    goal_seed: int = 0  # 0: the houses' own goals, else other ones in the same houses
-    exploration_reward: float = 0.0  # per square of floor that is new to the episode, see SQUARE
-
-    def __post_init__(self):
-        rules = (
-            (len(self.houses) >= 1, 'there is at least one house', self.houses),
-            (self.num_envs >= 1, 'there is at least one environment', self.num_envs),
-            (self.max_decisions >= 1, 'an episode has at least one decision', self.max_decisions),
-            (8 <= self.size <= 2048, 'pictures have 8 to 2048 pixels a side', self.size),
-            (self.task in TASKS, f'the task is one of {", ".join(TASKS)}', self.task),
-            (1 <= self.objects <= 16, 'there are 1 to 16 objects', self.objects),
-            (set(self.privileged) <= set(PRIVILEGED),
-             f'privileged outputs are some of {", ".join(PRIVILEGED)}', self.privileged),
-            (self.stop in STOPS, f'the stop is one of {", ".join(STOPS)}', self.stop),
-            (self.stop == 'arrival' or self.task == 'image',
-             'only the image task ends when the robot declares that it has arrived', self.task),
-            (self.goal_variants is None or 1 <= self.goal_variants <= 256,
-             'a goal has 1 to 256 pictures', self.goal_variants),
-            (self.goal_seed >= 0, 'the seed of goals is not negative', self.goal_seed),
-        )
-        for kept, rule, received in rules:
-            if not kept:
-                raise UserError(rule, received, 'correct the environment configuration')
-
-    @property
-    def pictures_per_goal(self) -> int:
-        """Differently lit pictures kept of each goal."""
-        return self.goal_variants or self.randomisation.pictures_per_goal
-
-
 class NavigationEnv(gymnasium.vector.VectorEnv):
-    """Visual navigation in embedded houses, or where another simulator puts the robots.
+    """Visual navigation in the places of a simulator.
 
     Observations are a dict of arrays over the N environments: `image` [N,3,H,W] uint8,
     `goal_index` [N] int64 into `goals`, `last_action` [N] int64 (-1 at an episode's start) and
@@ -125,34 +61,38 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         config: what to simulate.
         robot: actions, camera and footprint; the standard robot if left out.
         threads: threads that draw.
-        backend: robots and places instead of the configuration's houses: as many robots, and
-            pictures as large, as the configuration says.
+        simulator: robots and places instead of the configuration's scenes: as many robots, and
+            pictures as large, as the configuration says. It is closed with the environment.
+
+    Raises:
+        UserError: the simulator cannot do what the configuration asks for.
     """
 
     metadata = {'autoreset_mode': AutoresetMode.NEXT_STEP, 'render_modes': []}
 
     def __init__(self, config: EnvConfig | None = None, robot: RobotSpec | None = None, *,
-                 threads: int = 1, backend: Simulator | None = None):
+                 threads: int = 1, simulator: Simulator | None = None):
         self.config = config = config or EnvConfig()
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs = n = config.num_envs
-        if backend is None:
-            self.houses = [generate_house(seed, rooms=config.rooms,
-                                          goals_per_room=config.goals_per_room,
-                                          goal_seed=config.goal_seed)
-                           for seed in config.houses]
-        else:
-            self._check_backend(backend)
-            self.houses = list(backend.houses)
-        self._wanders = len(self.houses) > n and not config.one_goal_per_env
+        self.simulator: Simulator = simulator or open_simulator(config.scenes, Setup(
+            num_envs=n, robot=self.robot, size=config.size, threads=threads,
+            randomisation=config.randomisation, models=tasks.MODELS[config.task],
+            objects=config.objects if tasks.MODELS[config.task] else 0,
+            goals_per_room=config.goals_per_room, goal_seed=config.goal_seed))
+        try:
+            check_simulator(self.simulator, config, self.robot, given=simulator is not None)
+        except UserError:
+            if simulator is None:
+                self.simulator.close()
+            raise
+        self.places = list(self.simulator.places)
+        self._wanders = len(self.places) > n and not config.one_goal_per_env
         # Random numbers are functions of an environment's seed and number.
         self._seeds, self._numbers = np.full(n, config.seed, np.int64), np.arange(n)
         self.task = self._make_task()
-        self.backend: Simulator = backend or HouseBackend(
-            self.houses, np.arange(n) % len(self.houses), robot=self.robot, size=config.size,
-            threads=threads, randomisation=config.randomisation, models=self.task.models,
-            objects=self.task.objects)
-        self.world_version = self.backend.world_version
+        self.world_version = self.simulator.version
+        self.simulator_name = parse_scene(self.places[0].name).simulator
         self.action_names = self.robot.action_names
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
         self._deltas = np.array([[a.dx, a.dy, a.dyaw, a.dpitch] for a in self.robot.actions])
@@ -175,12 +115,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._done = np.ones(n, bool)
         self._motion_scale = np.ones(n)
         self._last_image = np.zeros((n, 3, config.size, config.size), np.uint8)
-        # Every environment's distances to its goal, side by side: one look-up for all.
-        shapes = [house.floor.free.shape for house in self.houses]
-        self._maps = np.full((n, max(s[0] for s in shapes), max(s[1] for s in shapes)), np.inf,
-                             np.float32)
-        self._origins = np.array([house.floor.origin for house in self.houses])
-        rows, columns = (math.ceil(side * CELL / SQUARE) for side in self._maps.shape[1:])
+        floors = all(getattr(place, 'floor', None) is not None for place in self.places)
+        self._distances = (FloorDistances(self.places, n) if floors else SeparateDistances(n))
+        cells = self._distances.maps.shape[1:] if floors else (0, 0)
+        rows, columns = (math.ceil(side * CELL / SQUARE) for side in cells)
         self._visited = np.zeros((n, rows, columns), bool)
         # Options that are off add nothing to the state.
         used = {'_visited': config.exploration_reward,
@@ -189,34 +127,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._explorer = self._make_explorer() if 'explorer_action' in config.privileged else None
         self._oracle: FloorOracle | None = None  # made when it is asked for
 
-    def _check_backend(self, backend: Simulator) -> None:
-        """Whether a simulator can do what the configuration asks for."""
-        config, can, told = self.config, backend.capabilities, set(self.config.privileged)
-        tilts = any(action.dpitch for action in self.robot.actions)
-        rules = (
-            (backend.num_envs == config.num_envs, 'a backend has as many robots as the '
-             f'configuration: {config.num_envs}', backend.num_envs),
-            (can.scene or config.task == 'image', 'the backend knows a floor and no rooms or '
-             'objects: its task is image', config.task),
-            (can.scene or 'explorer_action' not in told, 'the backend knows no walls, which the '
-             'explorer needs', 'explorer_action'),
-            (backend.routes is not None or 'oracle_regret' not in told,
-             'the backend knows what each action costs on the ways there (as an image graph does)',
-             'oracle_regret'),
-            (can.depth or 'depth' not in told, 'the backend has depth pictures', 'none'),
-            (can.labels or not told & {'segmentation', 'goal_segmentation'},
-             'the backend has labels', 'none'),
-            (can.tilt or not tilts, 'the camera of the backend is fixed',
-             self.robot.action_names),
-        )
-        for kept, rule, received in rules:
-            if not kept:
-                raise UserError(rule, received, 'correct the environment configuration')
-
     @property
-    def house_index(self) -> np.ndarray:
-        """[N] the house of each robot."""
-        return self.backend.house_index
+    def place_index(self) -> np.ndarray:
+        """[N] the place of each robot."""
+        return self.simulator.place_index
 
     def _make_explorer(self) -> Explorer:
         if self.config.task != 'image':
@@ -224,19 +138,19 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                             self.config.task, 'leave out explorer_action')
         table = turning_table(self.action_names)
         return Explorer(
-            self.houses, self.num_envs, fov=self.robot.camera_fov,
+            self.places, self.num_envs, fov=self.robot.camera_fov,
             turn=self._deltas[table['rotate_left'], 2], length=self._deltas[table['forward'], 0],
             radius=tasks.ARRIVAL_RADIUS)
 
     def _make_task(self) -> tasks.Task:
-        config, common = self.config, (self.houses, self.config.num_envs)
+        config, common = self.config, (self.places, self.config.num_envs)
         distance = config.min_start_distance
         if config.task == 'image':
             return tasks.ImageGoal(*common, min_distance=distance,
                                    fixed_goals=config.one_goal_per_env)
         if config.task == 'object':
             return tasks.ObjectGoal(
-                *common, models=GOAL_OBJECTS, objects=config.objects,
+                *common, models=tasks.MODELS['object'], objects=config.objects,
                 pictures=max(4, config.pictures_per_goal), min_distance=distance,
                 seed=config.seed)
         if config.task == 'room':
@@ -253,7 +167,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.goals = np.full((count + 1, 3, size, size), 128, np.uint8)
         self.goal_segmentation = np.zeros((count + 1, size, size), np.uint8)
         self.blank_goal = count
-        wanted = self.backend.capabilities.depth and bool(
+        wanted = self.simulator.capabilities.depth and bool(
             {'overlap', 'explorer_action'} & set(self.config.privileged))
         self._goal_points = np.full((count + 1 if wanted else 0, GRID * GRID, 3), np.nan,
                                     np.float32)
@@ -261,16 +175,16 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             part = slice(first, min(first + BATCH, count))
             view, variant = np.divmod(np.arange(part.start, part.stop), self._variants)
             poses = self.goal_poses[view]
-            appearance = self.backend.appearance(self.config.seed, Stream.GOAL_APPEARANCE, view,
-                                                 variant)
-            frames = self.backend.view(
-                np.array([views[k].house for k in view]), poses, None, appearance,
+            appearance = self.simulator.appearance(self.config.seed, Stream.GOAL_APPEARANCE, view,
+                                                   variant)
+            frames = self.simulator.view(
+                np.array([views[k].place for k in view]), poses, None, appearance,
                 key(self.config.seed, Stream.GOAL_APPEARANCE, view, variant, 99),
                 [views[k].objects for k in view])
             self.goals[part], self.goal_segmentation[part] = frames.rgb, frames.labels
             if wanted:
                 self._goal_points[part] = lift(frames.depth,
-                                               *self.backend.cameras(poses, appearance))
+                                               *self.simulator.cameras(poses, appearance))
 
     def _make_spaces(self) -> None:
         size, actions = self.config.size, len(self.action_names)
@@ -289,6 +203,22 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """Numbers that `step` takes."""
         return len(self.action_names) + (self.declare_action is not None)
 
+    @property
+    def _judges_poses(self) -> bool:
+        """Whether arriving at a pose is the task."""
+        return self.config.task == 'image' and not self.simulator.capabilities.rewards
+
+    @property
+    def restorable(self) -> bool:
+        """Whether `set_state` can put the robots back where they were."""
+        return self.simulator.capabilities.teleport
+
+    def close(self, **kwargs) -> None:
+        """Let go of the simulator; a second time it does nothing."""
+        if not self.closed:
+            self.simulator.close()
+        super().close(**kwargs)
+
     # The two switches that training and evaluation turn.
 
     def set_difficulty(self, tau: float) -> None:
@@ -298,22 +228,31 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._tau = float(tau)
 
     def set_shown_goal(self, mode: str) -> None:
-        """Which picture later episodes show: 'right', 'wrong' (same house) or 'blank'."""
+        """Which picture later episodes show: 'right', 'wrong' (same place) or 'blank'."""
         if mode not in (RIGHT, WRONG, BLANK):
             raise UserError('the shown goal is right, wrong or blank', mode, 'choose one of them')
         if mode == WRONG and min(count for _, count in self.task.ranges) < 2:
-            raise UserError('a wrong goal needs a house with at least two goals',
-                            self.config.rooms, 'use more rooms')
+            raise UserError('a wrong goal needs a place with at least two goals',
+                            ', '.join(self.config.scenes), 'use larger scenes')
         self._mode = mode
 
     _STATE = ('_episode', '_step', '_goal', '_goal_yaw', '_shown_goal', '_distance',
               '_start_distance', '_path_length', '_last_action', '_last_reward', '_done',
-              '_motion_scale', '_last_image', '_maps')
+              '_motion_scale', '_last_image')
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that changes from step to step; with equal switches `set_state` goes on."""
-        objects = self.backend.objects
-        more = {'house_index': self.house_index.copy()} if self._wanders else {}
+        """Everything that changes from step to step; with equal switches `set_state` goes on.
+
+        Raises:
+            UserError: the simulator cannot put robots back (`restorable`).
+        """
+        if not self.restorable:
+            raise UserError('only robots that can be put anywhere have a state to go on from',
+                            self.simulator_name, 'begin new episodes with `reset`')
+        objects = self.simulator.objects
+        more = {'house_index': self.place_index.copy()} if self._wanders else {}
+        if isinstance(self._distances, FloorDistances):
+            more['maps'] = self._distances.maps.copy()
         if self._explorer is not None:
             more |= {'explorer_seen': self._explorer.seen.copy(),
                      'explorer_found': self._explorer.found.copy()}
@@ -322,7 +261,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             self._numbers == np.arange(self.num_envs)).all()
         more |= {} if alike else {'numbers': self._numbers.copy()}
         seed = self._seeds[0] if alike else self._seeds.copy()
-        return {'poses': self.backend.poses.copy(), 'seed': np.array(seed), **more,
+        return {'poses': self.simulator.poses.copy(), 'seed': np.array(seed), **more,
                 **{name.strip('_'): getattr(self, name).copy() for name in self._state},
                 **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
                 **{f'task_{name}': part.copy() for name, part in self.task.state.items()}}
@@ -333,19 +272,24 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._numbers[:] = state.get('numbers', np.arange(self.num_envs))
         everyone = np.arange(self.num_envs)
         if self._wanders:
-            self.backend.enter(everyone, state['house_index'])
-        self.backend.place(everyone, state['poses'])
+            self.simulator.enter(everyone, state['house_index'])
+        self.simulator.place(everyone, state['poses'])
         for name in self._state:
             getattr(self, name)[:] = state[name.strip('_')]
+        if isinstance(self._distances, FloorDistances):
+            self._distances.maps[:] = state['maps']
+        else:
+            for n in everyone:
+                self._distances.set(n, self.task.goal_field(int(self._goal[n])).field)
         if self._explorer is not None:
             self._explorer.seen[:] = state['explorer_seen']
             self._explorer.found[:] = state['explorer_found']
-        for name, part in self.backend.objects._asdict().items():
+        for name, part in self.simulator.objects._asdict().items():
             part[:] = state[f'objects_{name}']
         for name, part in self.task.state.items():
             part[:] = state[f'task_{name}']
-        self.backend.dress(everyone, self._seeds, Stream.APPEARANCE, self._numbers,
-                           self._episode)
+        self.simulator.apply_appearance(everyone, self._seeds, Stream.APPEARANCE, self._numbers,
+                                        self._episode)
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None,
               options: dict | None = None):
@@ -406,20 +350,24 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         reset = self._done.copy()
         declared = ~reset & (actions == len(self.action_names))
         acting, driving = np.nonzero(~reset)[0], np.nonzero(~reset & ~declared)[0]
-        collided = np.zeros(self.num_envs, bool)
+        collided, motion = np.zeros(self.num_envs, bool), None
         before = self._distance.copy()
         if len(driving):
-            collided[driving] = self._drive(actions[driving], driving)
+            motion = self._drive(actions[driving], driving)
+            collided[driving] = motion.collided
         if reset.any():
             self._begin(np.nonzero(reset)[0])
         self._measure(acting)
         self._step[acting] += 1
         frames = self._look()
-        objects = self.backend.objects
+        objects = self.simulator.objects
         verdict = self.task.judge(tasks.Situation(
-            ~reset, self._distance, self._heading_error(), self.backend.poses, frames.labels,
-            self.backend.object_models(), objects.pose[:, :, :2],
+            ~reset, self._distance, self._heading_error(), self.simulator.poses, frames.labels,
+            self.simulator.object_models(), objects.pose[:, :, :2],
             None if self.declare_action is None else declared))
+        if self.simulator.capabilities.rewards:  # its own, in place of the task's
+            verdict = _paid(motion, driving, verdict)
+        ended = verdict.success if verdict.ended is None else verdict.ended
         objects.scene[verdict.removed] = -1
         reward = np.where(reset, 0, verdict.reward + tasks.shaping_reward(
             before, self._distance, collided, verdict.success,
@@ -429,32 +377,33 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             reward[acting] += self.config.exploration_reward * self._explore(acting)
         self._last_action[driving] = actions[driving]
         self._last_reward[acting] = verdict.reward[acting]
-        terminated = verdict.success | declared
+        terminated = ended | declared
         truncated = ~terminated & ~reset & (self._step >= self.config.max_decisions)
         self._done = terminated | truncated
         observation, info = self._result(frames, reset, verdict.success, collided)
         return observation, reward, terminated, truncated, info
 
-    def _drive(self, actions: np.ndarray, acting: np.ndarray) -> np.ndarray:
-        """Move some robots; whether they touched something."""
+    def _drive(self, actions: np.ndarray, acting: np.ndarray) -> Motion:
+        """Move some robots. On a grid nothing is noisy, slips or is worn."""
         delta = self._deltas[actions]
-        if self.config.noise:
+        continuous = self.simulator.capabilities.continuous
+        if self.config.noise and continuous:
             delta = motion_noise(delta, self._sizes[actions], normal(
                 self._seeds[acting], Stream.MOTION_NOISE, self._numbers[acting],
                 self._episode[acting], self._step[acting]))
-        motion = self.backend.move(self._as_driven(delta, acting), acting)
+        if continuous:
+            delta = self._as_driven(delta, acting)
+        motion = self.simulator.move(delta, acting)
         self._path_length[acting] += np.hypot(motion.delta[:, 0], motion.delta[:, 1])
-        return motion.collided
+        return motion
 
     def _as_driven(self, delta: np.ndarray, env_ids: np.ndarray) -> np.ndarray:
         """What a base with worn wheels on a smooth floor makes of displacements [K,4]."""
         config = self.config.randomisation
         share = self._motion_scale[env_ids]
         if config.slip:
-            counter = (self._seeds[env_ids], Stream.SLIP, self._numbers[env_ids],
-                       self._episode[env_ids], self._step[env_ids])
-            part = key(*counter) % np.uint64(1000) / 1000.0
-            share = np.where(uniform(*counter) < config.slip, part, 1.0) * share
+            share = draw_grip(config, self._seeds[env_ids], self._numbers[env_ids],
+                              self._episode[env_ids], self._step[env_ids]) * share
         delta = delta.copy()
         delta[:, :3] *= share[:, None]
         return delta
@@ -462,46 +411,47 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def _begin(self, env_ids: np.ndarray) -> None:
         """Draw goal, start, light and base of new episodes."""
         self._episode[env_ids] += 1
+        teleport = self.simulator.capabilities.teleport
         if self._wanders:
-            own = (len(self.houses) - 1 - env_ids) // self.num_envs + 1  # n, n + N, n + 2 N, ...
+            own = (len(self.places) - 1 - env_ids) // self.num_envs + 1  # n, n + N, n + 2 N, ...
             turn = own * uniform(self._seeds[env_ids], Stream.HOUSE, self._numbers[env_ids],
                                  self._episode[env_ids])
-            self.backend.enter(env_ids, env_ids + turn.astype(np.int64) * self.num_envs)
+            self.simulator.enter(env_ids, env_ids + turn.astype(np.int64) * self.num_envs)
         for n in env_ids:
             counter = (int(self._seeds[n]), int(self._numbers[n]), int(self._episode[n]))
-            episode = self.task.begin(int(n), int(self.house_index[n]), counter, self._tau,
+            episode = self.task.begin(int(n), int(self.place_index[n]), counter, self._tau,
                                       self._mode)
-            variant = tasks.draw_index(self._variants, counter[0], Stream.GOAL_VARIANT,
-                                       *counter[1:])
+            variant = draw_variant(self._variants, *counter)
             self._goal[n], self._goal_yaw[n] = episode.goal, episode.goal_yaw
             self._shown_goal[n] = (self.blank_goal if episode.shown < 0
                                    else episode.shown * self._variants + variant)
             true = episode.shown if self._mode == RIGHT else episode.goal
             self._picture[n] = true * self._variants + variant
-            self.backend.place(np.array([n]), episode.start[None])
-            self.backend.set_objects(n, episode.objects)
-            self._maps[n] = np.inf
-            if episode.field is not None:
-                rows, columns = episode.field.values.shape
-                self._maps[n, :rows, :columns] = episode.field.values
-        self.backend.dress(env_ids, self._seeds[env_ids], Stream.APPEARANCE,
-                           self._numbers[env_ids], self._episode[env_ids])
-        low, high = self.config.randomisation.motion_scale
-        self._motion_scale[env_ids] = low + (high - low) * uniform(
-            self._seeds[env_ids], Stream.BASE, self._numbers[env_ids], self._episode[env_ids])
+            if teleport:
+                self.simulator.place(np.array([n]), episode.start[None])
+            self.simulator.set_objects(n, episode.objects)
+            self._distances.set(n, episode.field)
+        counters = self._seeds[env_ids], self._numbers[env_ids], self._episode[env_ids]
+        if not teleport:
+            self.simulator.spawn(env_ids, key(counters[0], Stream.START_CELL, *counters[1:]))
+        self.simulator.apply_appearance(env_ids, counters[0], Stream.APPEARANCE, *counters[1:])
+        self._motion_scale[env_ids] = draw_motion_scale(self.config.randomisation, *counters)
         self._step[env_ids] = 0
         self._path_length[env_ids] = 0.0
         self._last_action[env_ids] = -1
         self._last_reward[env_ids] = 0.0
         self._measure(env_ids)
-        self._start_distance[env_ids] = self._distance[env_ids]
+        # Where nobody knows the ways no figure is made of the shortest one.
+        known = self.simulator.capabilities.geodesic
+        self._start_distance[env_ids] = self._distance[env_ids] if known else np.nan
         if self.config.exploration_reward:
             self._visited[env_ids] = False
             self._explore(env_ids)
 
     def _explore(self, env_ids: np.ndarray) -> np.ndarray:
         """Which robots stand on a square of floor that is new to their episodes, [K] bool."""
-        at = (self.backend.poses[env_ids, :2] - self._origins[self.house_index[env_ids]]) / SQUARE
+        corner = self._distances.origins[self.place_index[env_ids]]
+        at = (self.simulator.poses[env_ids, :2] - corner) / SQUARE
         column, row = at.astype(np.int64).T
         new = ~self._visited[env_ids, row, column]
         self._visited[env_ids, row, column] = True
@@ -510,18 +460,17 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def _measure(self, env_ids: np.ndarray) -> None:
         """Geodesic distance of robots to their goals; 0 where the task has none."""
         if self.config.task != 'collect':
-            self._distance[env_ids] = self._distance_of(env_ids, self.backend.poses[env_ids, :2])
+            self._distance[env_ids] = self._distance_of(env_ids, self.simulator.poses[env_ids, :2])
 
     def _distance_of(self, env_ids: np.ndarray, xy: np.ndarray) -> np.ndarray:
-        cells = (xy - self._origins[self.house_index[env_ids]]) / CELL - 0.5
-        return interpolate(self._maps, np.asarray(env_ids), cells[:, 0], cells[:, 1])
+        return self._distances.at(env_ids, self.place_index[env_ids], xy)
 
     def _heading_error(self) -> np.ndarray:
-        return tasks.heading_error(self.backend.poses[:, 2], self._goal_yaw)
+        return tasks.heading_error(self.simulator.poses[:, 2], self._goal_yaw)
 
     def _look(self) -> Frames:
-        return self.backend.observe(keys=key(self._seeds, Stream.SENSOR, self._numbers,
-                                             self._episode, self._step))
+        return self.simulator.observe(keys=key(self._seeds, Stream.SENSOR, self._numbers,
+                                               self._episode, self._step))
 
     def _result(self, frames: Frames, reset, success, collided):
         image = frames.rgb.copy()
@@ -541,7 +490,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'reset': reset,
             'success': success,
             'arrived': (tasks.arrived(self._distance, self._heading_error())
-                        if self.config.task == 'image' else success.copy()),
+                        if self._judges_poses else success.copy()),
             'collided': collided,
             'distance': self._distance.astype(np.float32),
             'heading_error': self._heading_error().astype(np.float32),
@@ -549,7 +498,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'path_length': self._path_length.astype(np.float32),
             'decisions': self._step.copy(),
             'goal': self._goal.copy(),
-            'pose': self.backend.poses.copy(),
+            'pose': self.simulator.poses.copy(),
         }
         if 'depth' in self.config.privileged:
             info['depth'] = frames.depth.copy()
@@ -560,8 +509,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if 'oracle_action' in self.config.privileged:
             info['oracle_action'] = self.oracle_actions()
         if 'oracle_regret' in self.config.privileged:
-            info['oracle_regret'] = self.backend.routes.regrets(self.backend.poses,
-                                                                self.goal_poses[self._goal])
+            info['oracle_regret'] = self.simulator.planner.regrets(self.simulator.poses,
+                                                                   self.goal_poses[self._goal])
         if 'goal_pose' in self.config.privileged:
             info['goal_pose'] = self._goal_pose()
         if {'overlap', 'explorer_action'} & set(self.config.privileged):
@@ -574,8 +523,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """What the `Explorer` would do, [N] int64; it looks from here."""
         self._explorer.begin(np.nonzero(reset)[0])
         turned = np.where(self._last_action < 0, 0, np.sign(self._deltas[self._last_action, 2]))
-        turns = self._explorer.turns(self.backend.poses, self.house_index, overlap,
-                                     self._distance, self._goal_yaw, self._maps, turned)
+        turns = self._explorer.turns(self.simulator.poses, self.place_index, overlap,
+                                     self._distance, self._goal_yaw, self._distances.maps,
+                                     turned)
         table = turning_table(self.action_names)
         return np.where(turns == 0, table['forward'], np.where(
             turns > 0, table['rotate_left'], table['rotate_right']))
@@ -583,32 +533,36 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def _goal_pose(self) -> np.ndarray:
         if not self.task.views:
             return np.zeros((self.num_envs, 4), np.float32)
-        # As the picture shows it, which was taken a little beside the robot in some backends.
-        return relative_pose(self.backend.seen_from,
+        # As the picture shows it, which was taken a little beside the robot in some simulators.
+        return relative_pose(self.simulator.seen_from,
                              self.goal_poses[self._picture // self._variants])
 
     def _overlap(self, depth: np.ndarray) -> np.ndarray:
         if not self.task.views:
             return np.zeros(self.num_envs, np.float32)
-        if not self.backend.capabilities.depth:
-            shown = self.backend.overlap(self.goal_poses[self._picture // self._variants])
+        if not self.simulator.capabilities.depth:
+            shown = self.simulator.co_visibility(self.goal_poses[self._picture // self._variants])
             return np.where(self._shown_goal == self.blank_goal, np.float32(0), shown)
         # The grey picture has no points.
         picture = np.where(self._shown_goal == self.blank_goal, self.blank_goal, self._picture)
-        return co_visible(self._goal_points[picture], depth, *self.backend.cameras())
+        return co_visible(self._goal_points[picture], depth, *self.simulator.cameras())
 
     def oracle_actions(self) -> np.ndarray:
         """The next action [N] on a shortest path to the goal, from the simulator's geometry.
 
-        See `oracle.FloorOracle`; a backend with routes of its own answers itself. Having arrived,
-        declare it where that ends an episode.
+        See `oracle.FloorOracle`; a simulator with a planner of its own answers itself. Having
+        arrived, declare it where that ends an episode.
         """
         if self.config.task == 'collect':
             raise UserError('the shortest-path action needs a task with a goal', 'collect',
                             'use another control')
+        if not (self.simulator.capabilities.geodesic or self.simulator.planner):
+            raise UserError('the shortest-path action needs a simulator that knows ways',
+                            self.simulator_name, 'use another control')
         there = tasks.arrived(self._distance, self._heading_error())
-        if self.backend.routes is not None:
-            actions = self.backend.routes.actions(self.backend.poses, self.goal_poses[self._goal])
+        if self.simulator.planner is not None:
+            actions = self.simulator.planner.actions(self.simulator.poses,
+                                                     self.goal_poses[self._goal])
         else:
             actions = self._floor_actions()
         return actions if self.declare_action is None else np.where(
@@ -619,66 +573,17 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             self._oracle = FloorOracle(self.action_names, self._deltas)
         near = (self._distance <= tasks.ARRIVAL_RADIUS) & (self.config.task == 'image')
         return np.array([self._oracle.action(
-            self.backend.poses[n], self._goal_yaw[n] if near[n] else None,
-            functools.partial(self.backend.reach, n),
+            self.simulator.poses[n], self._goal_yaw[n] if near[n] else None,
+            functools.partial(self.simulator.reach, n),
             lambda ends, n=n: self._distance_of(np.full(len(ends), n), ends))
             for n in range(self.num_envs)], np.int64)
 
 
-class HouseNavigation(gymnasium.Env):
-    """One robot in one house, for tools that want a single `gymnasium.Env`.
-
-    Observations: `image` and `goal`, both [3,H,W] uint8. Registered as `vn_nav/House-v0`.
-
-    Args:
-        house: seed of the house; rooms: its number of rooms.
-        options: further fields of `EnvConfig`; the randomisation may be given by name or file, so
-            that `spec.to_json()` can write it.
-    """
-
-    metadata = {'render_modes': ['rgb_array'], 'render_fps': 10}
-
-    def __init__(self, house: int = 0, rooms: int = 5, render_mode: str | None = None, **options):
-        self.render_mode = render_mode
-        # JSON has no tuples.
-        options = {name: tuple(value) if isinstance(value, list) else value
-                   for name, value in options.items()}
-        if isinstance(options.get('randomisation'), str):
-            options['randomisation'] = load_randomisation(options['randomisation'])
-        self._batch = NavigationEnv(EnvConfig(houses=(house,), rooms=rooms, num_envs=1, **options))
-        size = self._batch.config.size
-        picture = spaces.Box(0, 255, (3, size, size), np.uint8)
-        self.observation_space = spaces.Dict({'image': picture, 'goal': picture})
-        self.action_space = self._batch.single_action_space
-        self._image = np.zeros((3, size, size), np.uint8)
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Begin an episode; without a seed the next one of the sequence.
-
-        Raises:
-            UserError: a seed that is none, or options, which it does not have.
-        """
-        seed = read_seed(seed)
-        read_options(options)
-        super().reset(seed=seed)
-        observation, info = self._batch.reset(seed=seed)
-        return self._single(observation), {key: value[0] for key, value in info.items()}
-
-    def step(self, action):
-        """One decision."""
-        observation, reward, terminated, truncated, info = self._batch.step([int(action)])
-        return (self._single(observation), float(reward[0]), bool(terminated[0]),
-                bool(truncated[0]), {key: value[0] for key, value in info.items()})
-
-    def render(self):
-        """The robot's view, [H,W,3] uint8."""
-        return np.ascontiguousarray(self._image.transpose(1, 2, 0))
-
-    def _single(self, observation) -> dict:
-        self._image = observation['image'][0]
-        return {'image': self._image.copy(),
-                'goal': self._batch.goals[observation['goal_index'][0]].copy()}
-
-
-# By name: a callable cannot be written as JSON.
-gymnasium.register('vn_nav/House-v0', entry_point='vn_sim_bridge.navigation.env:HouseNavigation')
+def _paid(motion: Motion | None, driving: np.ndarray, verdict: tasks.Judgement
+          ) -> tasks.Judgement:
+    """What a simulator with rewards of its own says of robots [K] that drove."""
+    reward = np.zeros(len(verdict.success), np.float32)
+    ended = np.zeros(len(verdict.success), bool)
+    if motion is not None:
+        reward[driving], ended[driving] = motion.reward, motion.ended
+    return verdict._replace(reward=reward, ended=ended, success=ended & (reward > 0))

@@ -15,7 +15,9 @@ import math
 import numba
 import numpy as np
 
-from vn_sim_bridge.houses.house import CELL, House
+from vn_sim_bridge.floor.floor_map import CELL
+from vn_sim_bridge.houses.house import House
+from vn_sim_bridge.navigation.oracle import BLOCKED_COST, TURN_COST
 
 COARSE = 2  # cells of the floor map a side of one of the explorer's
 SIDE = COARSE * CELL  # m
@@ -23,9 +25,7 @@ SIGHT = 4.0  # m: what lies farther was not really looked at
 RAYS = 41  # across the camera's field of view
 NEAR = 1.0  # m: around itself a robot need not look
 ENOUGH = 0.25  # overlap with the goal picture from which the goal counts as seen
-TURN_COST = 0.05  # m, charged for one rotation
 TURN_BACK_COST = 0.6  # m, charged for rotating against the rotation before
-BLOCKED_COST = 1.0  # per metre that a contact cuts off a forward move
 FAR = np.float32(1e9)
 
 

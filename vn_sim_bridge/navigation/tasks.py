@@ -26,9 +26,18 @@ from vn_nav.arrival import (  # noqa: F401
     wrap_angle,
 )
 from vn_sim_bridge.counter_random import Stream, uniform
-from vn_sim_bridge.houses.house import DistanceField, Goal, House
+from vn_sim_bridge.floor.distance import FloorDistance
+from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.houses.labels import LABEL
-from vn_sim_bridge.simulator import Place
+from vn_sim_bridge.houses.objects import GOAL_OBJECTS
+from vn_sim_bridge.navigation.episodes import (
+    GoalField,
+    Starts,
+    draw_goal,
+    draw_index,
+    draw_wrong_goal,
+)
+from vn_sim_bridge.simulator import Distance, Place, Placed
 
 OBJECT_RADIUS = 1.0  # m, geodesic (thesis, 5.6)
 COLLECT_RADIUS = 0.45  # m, straight: the robot's rim touches the fruit
@@ -36,6 +45,9 @@ VISIBLE_SHARE = 0.045  # of the picture that shows the room's objects (House3D)
 VISIBLE_STEPS = 2  # decisions in a row
 FIELDS_KEPT = 512  # of `ImageGoal`, 0.1 MB each; a thousand others take 0.7 s to solve again
 RIGHT, WRONG, BLANK = 'right', 'wrong', 'blank'
+
+# Names of the objects that a task places.
+MODELS = {'image': (), 'object': GOAL_OBJECTS, 'room': (), 'collect': ('apple', 'lemon')}
 
 # What tells a room's type, for the rule of House3D's code.
 ROOM_OBJECTS = {
@@ -74,85 +86,10 @@ def shows_room(labels: np.ndarray, kind: str) -> np.ndarray:
     return np.isin(labels, wanted).mean(axis=(1, 2)) >= VISIBLE_SHARE
 
 
-def draw_index(count: int, seed: int, stream: Stream, env, episode, step=0) -> int:
-    """A whole number below `count`."""
-    return int(uniform(seed, stream, env, episode, step) * count)
-
-
-def draw_goal(count: int, seed: int, env, episode) -> int:
-    """Index of an episode's goal among `count`."""
-    return draw_index(count, seed, Stream.GOAL, env, episode)
-
-
-def draw_wrong_goal(count: int, right: int, seed: int, env, episode) -> int:
-    """Another goal of the same house, for the wrong-goal control."""
-    return (right + 1 + draw_index(count - 1, seed, Stream.WRONG_GOAL, env, episode)) % count
-
-
-class Starts:
-    """Where episodes towards a goal may start (in a house: the free cells), by distance.
-
-    Args:
-        house: the house, or another place.
-        field: distances to the goal.
-        min_distance: that a start keeps from the goal [m], as long as any cell does.
-    """
-
-    def __init__(self, house: Place, field: DistanceField, min_distance: float):
-        cells, headings = house.starts()
-        distance = field.distance(cells)
-        keep = np.isfinite(distance) & (distance >= min_distance)
-        if not keep.any():
-            keep = np.isfinite(distance)
-        order = np.argsort(distance[keep], kind='stable')
-        self.cells = cells[keep][order]  # [K,2], nearest first
-        self.distances = distance[keep][order]
-        self.headings = None if headings is None else headings[keep][order]  # None: any
-
-    def draw(self, tau: float, seed: int, env, episode) -> np.ndarray:
-        """A start pose for an episode: uniform over the cells within tau of the maximum distance.
-
-        Args:
-            tau: curriculum (thesis, section 4.5): share of the largest start distance, in (0, 1].
-            seed, env, episode: counter of the random numbers.
-
-        Returns:
-            [4] x, y, yaw, pitch.
-        """
-        limit = tau * self.distances[-1]
-        count = max(int(np.searchsorted(self.distances, limit, side='right')), 1)
-        cell = draw_index(count, seed, Stream.START_CELL, env, episode)
-        yaw = ((uniform(seed, Stream.START_YAW, env, episode) * 2 - 1) * math.pi
-               if self.headings is None else self.headings[cell])
-        return np.array([*self.cells[cell], float(yaw), 0.0])
-
-
-class GoalField:
-    """One goal pose of one house: distances to it, and where episodes towards it may start."""
-
-    def __init__(self, house: Place, goal: Goal, min_distance: float):
-        self.goal = goal
-        self.field: DistanceField = house.geodesic(goal.pose[0], goal.pose[1])
-        self.starts = Starts(house, self.field, min_distance)
-
-    def start(self, tau: float, seed: int, env, episode) -> np.ndarray:
-        """A start pose, see `Starts.draw`."""
-        return self.starts.draw(tau, seed, env, episode)
-
-
-class Placed(NamedTuple):
-    """A movable object on the floor: index of its model, position [m] and yaw [rad]."""
-
-    model: int
-    x: float
-    y: float
-    yaw: float
-
-
 class View(NamedTuple):
-    """A goal picture to take: where from, and what stands in the house meanwhile."""
+    """A goal picture to take: where from, and what stands in the place meanwhile."""
 
-    house: int
+    place: int
     pose: tuple[float, float, float, float]
     name: str  # of the goal, for people
     objects: tuple[Placed, ...] = ()
@@ -164,7 +101,7 @@ class Episode(NamedTuple):
     goal: int  # index of the view that names the true goal; -1: none
     shown: int  # index of the view that is shown; -1: none
     start: np.ndarray  # [4]
-    field: DistanceField | None  # to the goal
+    field: Distance | None  # to the goal
     goal_yaw: float  # rad
     objects: tuple[Placed, ...] = ()
 
@@ -175,6 +112,7 @@ class Judgement(NamedTuple):
     success: np.ndarray  # [N] bool: the episode ends well
     reward: np.ndarray  # [N] float32, sparse
     removed: np.ndarray  # [N,M] bool: objects that are gone now
+    ended: np.ndarray | None = None  # [N] bool: the episode ends, well or not; None: `success`
 
 
 class Situation(NamedTuple):
@@ -191,14 +129,14 @@ class Situation(NamedTuple):
 
 
 class Task(Protocol):
-    """Goals and rewards of N environments, of which i lives in house i modulo their number."""
+    """Goals and rewards of N environments, of which i lives in place i modulo their number."""
 
     views: list[View]
     models: tuple[str, ...]  # names of the objects that it places
     objects: int  # most objects at a time
     state: dict[str, np.ndarray]  # what changes from step to step
 
-    def begin(self, env: int, house: int, counter: tuple[int, int, int], tau: float,
+    def begin(self, env: int, place: int, counter: tuple[int, int, int], tau: float,
               mode: str) -> Episode:
         """A new episode of one environment; `mode` is which goal to show."""
 
@@ -231,16 +169,16 @@ class _Pool:
 class ImageGoal(_Pool):
     """To the pose from which a picture was taken (thesis, chapter 4)."""
 
-    def __init__(self, houses: Sequence[Place], num_envs: int, *, min_distance: float,
+    def __init__(self, places: Sequence[Place], num_envs: int, *, min_distance: float,
                  fixed_goals: bool = False):
         super().__init__()
-        self.fixed_goals, self.houses = fixed_goals, len(houses)
+        self.fixed_goals, self.places = fixed_goals, len(places)
         goals = []
-        for index, house in enumerate(houses):
-            self.ranges.append((len(self.views), len(house.goals)))
-            for goal in house.goals:
+        for index, place in enumerate(places):
+            self.ranges.append((len(self.views), len(place.goals)))
+            for goal in place.goals:
                 self.views.append(View(index, goal.pose, goal.room))
-                goals.append((house, goal))
+                goals.append((place, goal))
 
         @functools.lru_cache(FIELDS_KEPT)
         def goal_field(view: int) -> GoalField:
@@ -251,7 +189,7 @@ class ImageGoal(_Pool):
     def begin(self, env, house, counter, tau, mode) -> Episode:
         """Draw goal and start."""
         goal, shown = self.pick(house, counter, mode,
-                                env // self.houses if self.fixed_goals else None)
+                                env // self.places if self.fixed_goals else None)
         entry = self.goal_field(goal)
         return Episode(goal, shown, entry.start(tau, *counter), entry.field, entry.goal.pose[2])
 
@@ -321,7 +259,7 @@ class RoomGoal(_Pool):
         self.must_see = must_see
         self.kinds: list[str] = []  # of each view
         self.inside: list[tuple] = []  # per house, kind: rectangles of the rooms
-        self.fields: list[tuple[DistanceField, Starts]] = []
+        self.fields: list[tuple[FloorDistance, Starts]] = []
         self.state = {'seen': np.zeros(num_envs, np.int64), 'goal': np.zeros(num_envs, np.int64)}
         for index, house in enumerate(houses):
             by_kind: dict[str, list] = {}
@@ -334,7 +272,7 @@ class RoomGoal(_Pool):
                 self.views.append(View(index, goal.pose, kind.replace('_', ' ')))
                 self.kinds.append(kind)
                 self.inside.append(tuple(room.rect for room in rooms))
-                field = DistanceField.to_rectangles(house.floor, [room.rect for room in rooms])
+                field = FloorDistance.to_rectangles(house.floor, [room.rect for room in rooms])
                 self.fields.append((field, Starts(house, field, min_distance)))
 
     def begin(self, env, house, counter, tau, mode) -> Episode:
@@ -368,7 +306,7 @@ class Collect(_Pool):
     def __init__(self, houses: list[House], num_envs: int, *, objects: int):
         super().__init__()
         self.houses, self.objects = houses, objects
-        self.models = ('apple', 'lemon')
+        self.models = MODELS['collect']
         self.ranges = [(0, 0)] * len(houses)
 
     def begin(self, env, house, counter, tau, mode) -> Episode:
@@ -418,7 +356,7 @@ def _portrait(index: int, house: House, model: int, name: str, counter) -> View:
         if len(near) == 0:
             continue
         eye = near[draw_index(len(near), seed, Stream.OBJECT_PLACE, env, episode, 7000 + attempt)]
-        walk = house.geodesic(placed.x, placed.y).distance(eye[None])[0]
+        walk = house.geodesic(placed.x, placed.y).at(eye[None])[0]
         if walk < 1.1 * math.hypot(eye[0] - placed.x, eye[1] - placed.y) + 0.05:  # in sight
             break
     yaw = math.atan2(placed.y - eye[1], placed.x - eye[0])

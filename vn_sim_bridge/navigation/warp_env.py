@@ -17,6 +17,7 @@ from vn_nav.co_visibility import GRID, SLACK, TOLERANCE, lift
 from vn_nav.errors import UserError
 from vn_nav.reset_arguments import are_several, read_options, read_seed
 from vn_nav.robot import RobotSpec
+from vn_nav.scenes import HOUSE, one_simulator
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.floor.contacts import (
     MAX_TILT,
@@ -24,15 +25,14 @@ from vn_sim_bridge.floor.contacts import (
     ROTATION_NOISE,
     STEP,
     TRANSLATION_NOISE,
-    WORLD_VERSION,
 )
-from vn_sim_bridge.houses.house import CELL
-from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.floor.floor_map import CELL
 from vn_sim_bridge.navigation import tasks
-from vn_sim_bridge.navigation.env import EnvConfig
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.pack import FACING
 from vn_sim_bridge.render.randomisation import draw_appearance
 from vn_sim_bridge.render.warp_renderer import WarpRenderer, camera_frame
+from vn_sim_bridge.simulators.house import WORLD_VERSION, open_houses
 
 wp.set_module_options({'enable_backward': False, 'fast_math': False})
 
@@ -544,22 +544,23 @@ class WarpNavigationEnv:
         if config.randomisation.late_picture:
             raise UserError('pictures are never late on the device',
                             config.randomisation.late_picture, 'use NavigationEnv')
+        simulator, scenes = one_simulator(config.scenes)
+        if simulator != HOUSE:
+            raise UserError('the device draws embedded houses', simulator, 'use NavigationEnv')
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs, self.device = config.num_envs, device
         if wp.get_device(device).is_cuda:
             wp.set_stream(wp.stream_from_torch(wp.device_to_torch(device)), device)
         self.world_version, self.action_names = WORLD_VERSION, self.robot.action_names
-        self.houses = [generate_house(seed, rooms=config.rooms,
-                                      goals_per_room=config.goals_per_room,
-                                      goal_seed=config.goal_seed)
-                       for seed in config.houses]
-        if self.robot.footprint_radius > min(h.footprint_radius for h in self.houses):
+        self.simulator_name = HOUSE
+        self.places = open_houses(scenes, config.goals_per_room, config.goal_seed)
+        if self.robot.footprint_radius > min(h.footprint_radius for h in self.places):
             raise UserError('the robot fits into the floor map of the house',
                             self.robot.footprint_radius, 'use a smaller robot')
-        task = tasks.ImageGoal(self.houses, self.num_envs, min_distance=config.min_start_distance)
+        task = tasks.ImageGoal(self.places, self.num_envs, min_distance=config.min_start_distance)
         self.goal_rooms = tuple(view.name for view in task.views)
         self.goal_poses = np.array([view.pose for view in task.views])
-        scenes = [house.scene for house in self.houses]
+        scenes = [house.scene for house in self.places]
         self.renderer = WarpRenderer(scenes, config.size, self.num_envs, device=device)
         self._houses = self._upload_houses(task)
         self._rules = self._make_rules()
@@ -588,10 +589,10 @@ class WarpNavigationEnv:
         for k, entry in enumerate(fields):
             maps[k, :shapes[k][0], :shapes[k][1]] = entry.field.values
         out = Houses()
-        out.rects = self._put(np.concatenate([h.obstacle_rects for h in self.houses]), np.float64)
+        out.rects = self._put(np.concatenate([h.obstacle_rects for h in self.places]), np.float64)
         out.first_rect = self._put(
-            np.cumsum([0] + [len(h.obstacles) for h in self.houses]), np.int32)
-        out.origin = self._put([h.floor.origin for h in self.houses], np.float64)
+            np.cumsum([0] + [len(h.obstacles) for h in self.places]), np.int32)
+        out.origin = self._put([h.floor.origin for h in self.places], np.float64)
         out.first_goal = self._put(np.cumsum([0] + [count for _, count in task.ranges]), np.int32)
         out.goal_pose = self._put(self.goal_poses, np.float64)
         out.maps = self._put(maps, np.float32)
@@ -607,7 +608,7 @@ class WarpNavigationEnv:
         rules = Rules()
         rules.seed, rules.mode, rules.tau = config.seed, 0, 1.0
         rules.variants = config.pictures_per_goal
-        rules.environments, rules.houses = self.num_envs, len(self.houses)
+        rules.environments, rules.houses = self.num_envs, len(self.places)
         rules.blank_goal = len(self.goal_poses) * rules.variants
         rules.max_decisions = config.max_decisions
         rules.motion_noise = int(config.noise)
@@ -631,7 +632,7 @@ class WarpNavigationEnv:
         for name, variable in Robots.vars.items():
             setattr(robots, name, wp.zeros(shapes.get(name, (n,)), dtype=variable.type.dtype,
                                            device=self.device))
-        robots.house = self._put(np.arange(n) % len(self.houses), np.int64)
+        robots.house = self._put(np.arange(n) % len(self.places), np.int64)
         robots.episode.fill_(-1)
         return robots
 
@@ -656,7 +657,7 @@ class WarpNavigationEnv:
                       'keys': self._put(key(self.config.seed, Stream.GOAL_APPEARANCE, goal,
                                             variant, 99), np.uint64)}
         painter.render(
-            self._put([task.views[k].house for k in goal], np.int64),
+            self._put([task.views[k].place for k in goal], np.int64),
             self._put(cameras, np.float64), self._put(focal, np.float64),
             self._put(look.cube, np.float32), self._put(look.lamps, np.float32),
             object_scene=self._put(none, np.int64),
@@ -683,9 +684,9 @@ class WarpNavigationEnv:
         """As `NavigationEnv.set_shown_goal`."""
         if mode not in MODES:
             raise UserError('the shown goal is right, wrong or blank', mode, 'choose one of them')
-        if mode == tasks.WRONG and min(len(house.goals) for house in self.houses) < 2:
-            raise UserError('a wrong goal needs a house with at least two goals',
-                            self.config.rooms, 'use more rooms')
+        if mode == tasks.WRONG and min(len(house.goals) for house in self.places) < 2:
+            raise UserError('a wrong goal needs a place with at least two goals',
+                            ', '.join(self.config.scenes), 'use larger scenes')
         self._rules.mode = MODES[mode]
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
@@ -722,9 +723,14 @@ class WarpNavigationEnv:
         return observation, state['reward'], state['terminated'], state['truncated'], info
 
     @property
-    def house_index(self) -> torch.Tensor:
+    def place_index(self) -> torch.Tensor:
         """[N] the house of each robot."""
         return self._state['house']
+
+    restorable = True  # see `NavigationEnv.restorable`
+
+    def close(self) -> None:
+        """Nothing is held beyond the arrays, which go with this object."""
 
     def get_state(self) -> dict[str, np.ndarray]:
         """As `NavigationEnv.get_state`; this waits for the device."""

@@ -21,8 +21,10 @@ from vn_nav.co_visibility import co_visible_by_poses, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess
 from vn_nav.robot import RobotSpec
-from vn_sim_bridge.houses.house import CELL, DistanceField, FloorMap, Goal
+from vn_sim_bridge.floor.distance import FloorDistance
+from vn_sim_bridge.floor.floor_map import CELL, FloorMap
 from vn_sim_bridge.recorded.pose_lattice import PoseMap, in_sight
+from vn_sim_bridge.simulator import Goal
 
 MARGIN = 0.3  # m beside the driven path
 JUMP = 0.7  # m between two pictures in a row: farther apart, nobody knows the way
@@ -32,6 +34,7 @@ APART = (1.0, math.radians(60))  # m, rad: what counts as one between two goals
 CLOSE = 0.25  # goals nearer than that are one
 PLAIN = 8.0  # grey levels: a goal picture that varies less shows nothing
 LEAST_GOALS = 4
+RECORDED_SCENE = 'bag:drive'  # a drive that nobody named
 LEAST_WAY = 2.0  # m between some two of the poses
 ALIKE, SHOWN_SIDE = 0.95, 16  # correlation of small pictures from which on they are one view
 
@@ -40,7 +43,7 @@ ALIKE, SHOWN_SIDE = 0.95, 16  # correlation of small pictures from which on they
 class ImageGraph:
     """Recorded pictures as a place (`simulator.Place`) with K nodes, S pixels a side."""
 
-    seed: int  # its number, for people and figures
+    name: str  # of its scene, 'bag:my_drive'
     pictures: np.ndarray  # [K,3,S,S] uint8
     poses: np.ndarray  # [K,3] float64 x, y [m], yaw [rad]
     depth: np.ndarray | None  # [K,S,S] float16 m along the optical axis; 0: unknown
@@ -56,9 +59,9 @@ class ImageGraph:
         """Where the robot can stand."""
         return self.map.floor
 
-    def geodesic(self, x: float, y: float) -> DistanceField:
-        """Shortest driving distance from anywhere to (x, y)."""
-        return DistanceField(self.floor, x, y)
+    def distance_to(self, goal: Goal) -> FloorDistance:
+        """Shortest driving distance from anywhere to a goal."""
+        return FloorDistance(self.floor, *goal.pose[:2])
 
     def starts(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions [K,2] and headings [K] of the pictures."""
@@ -75,8 +78,8 @@ class ImageGraph:
                          np.ascontiguousarray(goal_poses[:, :2], float), self.floor.free,
                          *self.floor.origin)
 
-    def overlap(self, poses: np.ndarray, goal_poses: np.ndarray, fov: float) -> np.ndarray:
-        """What poses [N,>=3] alone say of the overlap of pictures; see `co_visible_by_poses`.
+    def co_visibility(self, poses: np.ndarray, goal_poses: np.ndarray, fov: float) -> np.ndarray:
+        """What poses [N,>=3] alone say of what two pictures share; see `co_visible_by_poses`.
 
         A straight way over the floor stands for having driven it: nothing is in between.
         """
@@ -84,8 +87,8 @@ class ImageGraph:
         driven = np.where(self.in_sight(poses, goal_poses), gap, np.inf)
         return co_visible_by_poses(relative_pose(poses, goal_poses), driven, fov)
 
-    def floor_plan(self) -> dict:
-        """See `House.floor_plan`; what is no floor counts as outside."""
+    def plan(self) -> dict:
+        """See `House.plan`; what is no floor counts as outside."""
         free, (x0, y0) = self.floor.free, self.floor.origin
         rows, columns = free.shape
         outside = []
@@ -93,7 +96,7 @@ class ImageGraph:
             edges = np.flatnonzero(np.diff(free[i], prepend=True, append=True))
             outside += [[x0 + a * CELL, y0 + i * CELL, x0 + b * CELL, y0 + (i + 1) * CELL]
                         for a, b in zip(edges[::2], edges[1::2], strict=True)]
-        return {'house': self.seed, 'area': float(free.sum() * CELL**2),
+        return {'scene': self.name, 'area': float(free.sum() * CELL**2),
                 'bounds': [x0, y0, x0 + columns * CELL, y0 + rows * CELL],
                 'rooms_list': [], 'walls': [], 'obstacles': [], 'outside': outside,
                 'goals': [{'room': goal.room, 'pose': list(goal.pose)} for goal in self.goals]}
@@ -112,8 +115,8 @@ class ImageGraph:
 
 def build_graph(pictures: np.ndarray, poses: np.ndarray, episode: np.ndarray, robot: RobotSpec, *,
                 depth: np.ndarray | None = None, farthest: float = 10.0, goals: int = 96,
-                goal_pictures: np.ndarray | None = None, margin: float = MARGIN, seed: int = 0,
-                world_version: str) -> ImageGraph:
+                goal_pictures: np.ndarray | None = None, margin: float = MARGIN,
+                name: str = RECORDED_SCENE, world_version: str) -> ImageGraph:
     """A graph of the pictures of a drive.
 
     Of many pictures from one pose `KEPT` stay. What a robot cannot drive to and back from, by its
@@ -128,7 +131,7 @@ def build_graph(pictures: np.ndarray, poses: np.ndarray, episode: np.ndarray, ro
         goals: at most so many, spread over places and headings.
         goal_pictures: [G,3,S,S] shown to the robot; what the drive has seen too becomes a goal.
         margin: m beside the driven path that count as free.
-        seed: number of the place.
+        name: of its scene.
         world_version: of the simulator that drew the pictures, or `recorded`.
 
     Raises:
@@ -156,7 +159,7 @@ def build_graph(pictures: np.ndarray, poses: np.ndarray, episode: np.ndarray, ro
                      'cover')
     own = np.ascontiguousarray(pictures[kept])
     graph = ImageGraph(
-        seed=seed, pictures=own, poses=poses[kept], episode=np.asarray(episode)[kept],
+        name=name, pictures=own, poses=poses[kept], episode=np.asarray(episode)[kept],
         depth=None if depth is None else _metres(depth[kept], farthest), map=whole, goals=(),
         goal_nodes=(), world_version=world_version, words=())
     chosen = _spread(graph.poses, _plain(own), goals)

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
-from vn_sim_bridge.houses.house import CELL, FloorMap, main_component
+from vn_sim_bridge.floor.floor_map import CELL, FloorMap, main_component
 
 HEADINGS = 72  # layers
 HEADING = 2 * math.pi / HEADINGS  # rad between two

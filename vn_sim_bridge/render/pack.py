@@ -24,14 +24,6 @@ class Lights(NamedTuple):
     lamps: np.ndarray  # [N,R,3] float32: the lamp of each room
 
 
-class Objects(NamedTuple):
-    """Up to M movable objects in each of N cameras' views."""
-
-    scene: np.ndarray  # [N,M] int64: index of the object's scene; -1: absent
-    pose: np.ndarray  # [N,M,4] float64: x, y, z [m], yaw [rad] in the map frame
-    room: np.ndarray  # [N,M] int64: whose lamp shines on it
-
-
 class Pack(NamedTuple):
     """The arrays of several scenes, concatenated (see `Scene`)."""
 
@@ -61,12 +53,6 @@ def standard_lights(count: int, rooms: int) -> Lights:
     cube = np.repeat((0.62 * FACING)[None, :, None], count, axis=0)
     return Lights(np.ascontiguousarray(np.repeat(cube, 3, axis=2), np.float32),
                   np.full((count, rooms, 3), 0.5, np.float32))
-
-
-def no_objects(count: int, most: int = 0) -> Objects:
-    """Nothing that moves: room for `most` objects a camera, all absent."""
-    return Objects(np.full((count, most), -1, np.int64), np.zeros((count, most, 4)),
-                   np.zeros((count, most), np.int64))
 
 
 def pack_scenes(scenes: Sequence[Scene]) -> Pack:

@@ -24,12 +24,11 @@ from vn_sim_bridge.render.pack import (
     CLUSTER,
     EMPTY,
     Lights,
-    Objects,
-    no_objects,
     pack_scenes,
     standard_lights,
 )
 from vn_sim_bridge.render.scene import MAX_CORNERS, MAX_LIGHT_NODES, Scene
+from vn_sim_bridge.simulator import Objects, no_objects
 
 NEAR = 0.03  # m, near plane
 TILE = 8  # pixels a side, of the coarse depth that hides groups

@@ -517,7 +517,7 @@ class WarpRenderer:
         Args:
             scene_index: [N] int64; cameras: [N,5] float64; focal: [N] float64 pixels.
             cube, lamps: as in `pack.Lights`.
-            object_scene, object_pose, object_room: as in `pack.Objects`.
+            object_scene, object_pose, object_room: as in `Objects`.
             noise, blur, keys: [N], as in `sensor.expose`; all or none.
         """
         count, size = self.count, self.size

@@ -14,7 +14,9 @@ import math
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
-from vn_sim_bridge.houses.house import CELL, DistanceField, House, clearance
+from vn_sim_bridge.floor.distance import FloorDistance
+from vn_sim_bridge.floor.floor_map import CELL, clearance
+from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.robot.simulated_robot import TICK
 
 MAX_LINEAR, MAX_ANGULAR = 0.3, 0.8  # m/s, rad/s
@@ -176,7 +178,7 @@ class Joystick:
         return float(self._gap[i, j])
 
 
-def cover(house: House, gap: np.ndarray, spacing: float) -> tuple[np.ndarray, list[DistanceField]]:
+def cover(house: House, gap: np.ndarray, spacing: float) -> tuple[np.ndarray, list[FloorDistance]]:
     """Places from which all of the floor is near, except for what is left over in corners.
 
     Greedy: the next place is the one with the most floor within `COVER` spacings, driving, that no
@@ -195,7 +197,7 @@ def cover(house: House, gap: np.ndarray, spacing: float) -> tuple[np.ndarray, li
     candidates = cells[chosen if chosen.any() else roomy if roomy.any() else slice(None)]
     radius = COVER * spacing
     fields = [house.geodesic(x, y) for x, y in candidates]
-    near = np.array([field.distance(cells) <= radius for field in fields])
+    near = np.array([field.at(cells) <= radius for field in fields])
     least = LEFT_OVER * math.pi * radius**2 / CELL**2
     open_floor = np.ones(len(cells), bool)
     picked: list[int] = []
@@ -208,15 +210,15 @@ def cover(house: House, gap: np.ndarray, spacing: float) -> tuple[np.ndarray, li
         open_floor &= ~near[best]
 
 
-def tour(places: np.ndarray, fields: list[DistanceField], start: np.ndarray) -> list[int]:
+def tour(places: np.ndarray, fields: list[FloorDistance], start: np.ndarray) -> list[int]:
     """A short order of places [W,2] from a start: the nearest next, then 2-opt.
 
     Args:
         fields: distances to each place.
         start: [2] m.
     """
-    first = np.array([field.distance(start[None])[0] for field in fields])
-    between = np.array([field.distance(places) for field in fields])
+    first = np.array([field.at(start[None])[0] for field in fields])
+    between = np.array([field.at(places) for field in fields])
     order, left = [int(np.argmin(first))], set(range(len(places)))
     left.remove(order[0])
     while left:

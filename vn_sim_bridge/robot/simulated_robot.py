@@ -1,4 +1,4 @@
-"""One robot in one embedded house, driven by velocities in ticks: the bridge without ROS.
+"""One robot in one place of a simulator, driven by velocities in ticks: the bridge without ROS.
 
 What a tick, a decision and an episode are is docs/architecture.md, "Time". This class judges
 episodes exactly as `NavigationEnv` does, from whatever velocities it is given.
@@ -16,14 +16,20 @@ from vn_nav.errors import UserError
 from vn_nav.robot import AXES, RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.floor.contacts import motion_noise, nominal_sizes
-from vn_sim_bridge.houses.house import Goal
-from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.navigation import tasks
+from vn_sim_bridge.navigation.episodes import (
+    MIN_START_DISTANCE,
+    GoalField,
+    draw_goal,
+    draw_grip,
+    draw_motion_scale,
+    draw_variant,
+)
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.robot.odometry import Uncertainty, advance, drift_errors
 from vn_sim_bridge.robot.simulated_base import SimulatedBase
-from vn_sim_bridge.simulator import Frames
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulator import Frames, Goal, Setup
+from vn_sim_bridge.simulators import open_simulator
 
 TICK = 0.05  # s of simulated time
 TERMINATED, TRUNCATED = 1, 2
@@ -36,7 +42,7 @@ class Episode:
     index: int
     goal: int  # index into the goals; -1: a goal by pose
     start: tuple[float, ...]  # x, y, yaw, pitch
-    start_distance: float  # m, geodesic
+    start_distance: float | None  # m, geodesic; None: nobody knows the ways
     begun_at: float  # s, simulated
     decisions: int = 0
     collisions: int = 0  # decisions that touched something
@@ -58,7 +64,7 @@ class SimulatedRobot:
     """Motion, odometry, decisions and episodes of one robot.
 
     Args:
-        house, rooms: seed of the house and its number of rooms.
+        scene: its name, see `vn_nav.scenes`.
         robot: limits, camera, footprint; its action table gives the noise's nominal sizes.
         size: side of the pictures [pixels].
         noise: Gaussian motion noise; odometry reports the motion without it.
@@ -68,25 +74,31 @@ class SimulatedRobot:
         stop: 'arrival' ends an episode, or 'declared': only `declare` does, as in `EnvConfig`.
         randomisation: of light, camera and base; default: nothing varies.
         odometry_drift: errors of odometry (`odometry.drift_errors`) beside motion noise; 0: none.
-        goal_poses: x, y [m], yaw [rad] of the goals to draw from; default: the house's.
+        goal_poses: x, y [m], yaw [rad] of the goals to draw from; default: the place's.
 
     Raises:
-        UserError: a goal where the robot cannot stand.
+        UserError: a goal where the robot cannot stand; a simulator that is no robot's world: its
+            robots cannot be put anywhere, or drive by whole actions.
     """
 
-    def __init__(self, house: int, rooms: int, *, robot: RobotSpec, size: int = 84,
+    def __init__(self, scene: str, *, robot: RobotSpec, size: int = 84,
                  noise: bool = True, seed: int = 0, max_decisions: int = 300,
                  stop: str = 'arrival', randomisation: Randomisation | None = None,
                  odometry_drift: float = 0.0,
                  goal_poses: Sequence[tuple[float, float, float]] | None = None):
         self.stop_rule = stop
-        self.house = generate_house(house, rooms=rooms)
         self.robot, self.noise, self.seed, self.max_decisions = robot, noise, seed, max_decisions
         self.randomisation = randomisation or Randomisation()
-        self.backend = HouseBackend([self.house], [0], robot=robot, size=size,
-                                    randomisation=self.randomisation)
+        self.simulator = open_simulator([scene], Setup(1, robot, size,
+                                                       randomisation=self.randomisation))
+        try:
+            self._check_simulator(scene)
+        except UserError:
+            self.simulator.close()
+            raise
+        self.place = self.simulator.places[0]
         self.fields = (
-            [tasks.GoalField(self.house, goal, 1.0) for goal in self.house.goals]
+            [GoalField(self.place, goal, MIN_START_DISTANCE) for goal in self.place.goals]
             if goal_poses is None else [self._field_at(*pose) for pose in goal_poses])
         self._nominal = nominal_sizes(robot)
         self.tick_count = 0
@@ -102,7 +114,24 @@ class SimulatedRobot:
         self._share = self._motion_scale = 1.0  # metres driven per metre asked for
         self._shown: Frames | None = None
         # Compile the motion now, not when the first command is in force.
-        self.backend.move(np.zeros((1, 4)))
+        self.simulator.move(np.zeros((1, 4)))
+
+    def _check_simulator(self, scene: str) -> None:
+        can = self.simulator.capabilities
+        rules = (
+            (can.continuous and can.teleport, 'a robot that is driven by velocities needs a '
+             'simulator of continuous motion that puts it anywhere'),
+            (not can.rewards, 'the bridge judges arrival itself: no simulator that pays'),
+            (can.appearance or not self.randomisation.varies_pictures,
+             'light and camera vary in simulators that draw them: randomisation none'),
+        )
+        for kept, rule in rules:
+            if not kept:
+                raise UserError(rule, scene, 'choose another scene (vn_nav simulators)')
+
+    def close(self) -> None:
+        """Let go of the simulator."""
+        self.simulator.close()
 
     @property
     def time(self) -> float:
@@ -112,7 +141,7 @@ class SimulatedRobot:
     @property
     def pose(self) -> np.ndarray:
         """True x, y, yaw, pitch in the map frame, [4]."""
-        return self.backend.poses[0]
+        return self.simulator.poses[0]
 
     @property
     def goal(self) -> Goal:
@@ -124,30 +153,29 @@ class SimulatedRobot:
         """Draw goal and start of episode `index`, and put the robot there.
 
         Args:
-            goal_pose: x, y [m], yaw [rad] of a goal instead of one of the house's.
+            goal_pose: x, y [m], yaw [rad] of a goal instead of one of the place's.
 
         Raises:
             UserError: a goal where the robot cannot stand.
         """
         counter = (self.seed, index, 0)
         if goal_pose is None:
-            chosen = tasks.draw_goal(len(self.fields), *counter)
+            chosen = draw_goal(len(self.fields), *counter)
             field = self.fields[chosen]
         else:
             chosen, field = -1, self._field_at(*goal_pose)
         self._field = field
         start = field.start(1.0, *counter)
-        self.backend.place(np.array([0]), start[None])
+        self.simulator.place(np.array([0]), start[None])
         self.base.stop()
         self.velocity = np.zeros(4)
         self._in_decision = self._touched = False
-        self.backend.dress(np.array([0]), self.seed, Stream.APPEARANCE, index, 0)
-        low, high = self.randomisation.motion_scale
-        self._motion_scale = low + (high - low) * float(
-            uniform(self.seed, Stream.BASE, index, 0))
+        self.simulator.apply_appearance(np.array([0]), self.seed, Stream.APPEARANCE, index, 0)
+        self._motion_scale = float(draw_motion_scale(self.randomisation, *counter))
         self._shown = None
         self.episode = Episode(index, chosen, tuple(float(v) for v in start),
-                               self.distance(), self.time)
+                               self.distance() if self.simulator.capabilities.geodesic else None,
+                               self.time)
         return self.episode
 
     def place_freely(self, index: int) -> None:
@@ -155,15 +183,16 @@ class SimulatedRobot:
         self.begin_episode(index)
         self.episode = None
 
-    def _field_at(self, x: float, y: float, yaw: float) -> tasks.GoalField:
-        centres = self.house.floor.centres()
+    def _field_at(self, x: float, y: float, yaw: float) -> GoalField:
+        spots = self.place.starts()[0]
         if not np.isfinite([x, y, yaw]).all() or (
-                np.hypot(*(centres - [x, y]).T).min() > 0.1):
+                np.hypot(*(spots - [x, y]).T).min() > 0.1):
+            corners = (*spots.min(axis=0).tolist(), *spots.max(axis=0).tolist())
             raise UserError('a goal lies where the robot can stand', (x, y, yaw),
-                            f'choose a free place within {tuple(self.house.outline)} (x0, y0, x1, '
-                            'y1 in metres); the scene topic has the map')
-        goal = Goal((x, y, yaw, 0.0), self.house.room_at(x, y) or 'door')
-        return tasks.GoalField(self.house, goal, 1.0)
+                            f'choose a free place within {corners} (x0, y0, x1, y1 in metres); '
+                            'the scene topic has the map')
+        name = getattr(self.place, 'room_at', lambda x, y: 'goal')(x, y) or 'door'
+        return GoalField(self.place, Goal((x, y, yaw, 0.0), name), MIN_START_DISTANCE)
 
     def goal_frames(self) -> Frames:
         """The goal picture (and its depth and labels), in a light of its own."""
@@ -171,24 +200,24 @@ class SimulatedRobot:
         index, goal = self.episode.index, self.episode.goal
         variants = self.randomisation.pictures_per_goal
         variant = (index if goal < 0 else
-                   int(uniform(self.seed, Stream.GOAL_VARIANT, index, 0) * variants))
+                   draw_variant(variants, self.seed, index, 0))
         counter = (self.seed, Stream.GOAL_APPEARANCE, np.array([goal]), np.array([variant]))
-        return self.backend.view(np.zeros(1, np.int64), np.array([self.goal.pose]), None,
-                                 self.backend.appearance(*counter), key(*counter, 99))
+        return self.simulator.view(np.zeros(1, np.int64), np.array([self.goal.pose]), None,
+                                   self.simulator.appearance(*counter), key(*counter, 99))
 
     def observe(self) -> Frames:
         """The camera's picture; with a late camera at times the one before."""
         index = self.episode.index if self.episode else 0
         counter = (self.seed, Stream.LATE_PICTURE, index, 0, self.tick_count)
         if self._shown is None or uniform(*counter) >= self.randomisation.late_picture:
-            frames = self.backend.observe(keys=np.atleast_1d(
+            frames = self.simulator.observe(keys=np.atleast_1d(
                 key(self.seed, Stream.SENSOR, index, 0, self.tick_count)))
             self._shown = Frames(*(part.copy() for part in frames))
         return self._shown
 
     def distance(self) -> float:
         """Geodesic distance to the goal [m]."""
-        return float(self._field.field.distance(self.pose[None, :2])[0])
+        return float(self._field.field.at(self.pose[None, :2])[0])
 
     def drive(self, command: np.ndarray) -> Decision | None:
         """Advance by one tick as the base follows a command, within the robot's limits.
@@ -228,7 +257,7 @@ class SimulatedRobot:
         wanted = self.velocity * TICK
         delta = self._with_noise(wanted) if self.noise else wanted.copy()
         delta[:3] *= self._share
-        motion = self.backend.move(delta[None])
+        motion = self.simulator.move(delta[None])
         done = motion.delta[0]
         length = math.hypot(delta[0], delta[1])
         travelled = math.hypot(done[0], done[1])
@@ -246,11 +275,8 @@ class SimulatedRobot:
 
     def _slip(self) -> float:
         """The share of a new decision's motion that the wheels turn into driving."""
-        counter = (self.seed, Stream.SLIP, self.episode.index if self.episode else 0, 0,
-                   self.tick_count)
-        if uniform(*counter) >= self.randomisation.slip:
-            return 1.0
-        return float(key(*counter) % np.uint64(1000)) / 1000.0
+        index = self.episode.index if self.episode else 0
+        return float(draw_grip(self.randomisation, self.seed, index, 0, self.tick_count))
 
     def _with_noise(self, wanted: np.ndarray) -> np.ndarray:
         number = normal(self.seed, Stream.MOTION_NOISE, 0, self.episode.index if self.episode

@@ -1,1 +1,102 @@
-"""Simulators behind one protocol: motion and pixels, no tasks."""
+"""The simulators by name: a table that imports none of them before it is asked for.
+
+A simulator outside this package registers itself, without a change here, in either way:
+
+- an entry point of the group `vn_nav.simulators` in its own package:
+  `corridor = my_robot.corridor`;
+- its module's name, with a dot, in front of the scene: `examples.corridor:8`.
+
+Such a module has a class `SIMULATOR` (see `vn_sim_bridge.simulator.BaseSimulator`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Sequence
+
+from vn_nav.errors import UserError
+from vn_nav.scenes import one_simulator
+from vn_sim_bridge.simulator import BaseSimulator, Setup, Simulator
+
+GROUP = 'vn_nav.simulators'  # of entry points
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A row of the table."""
+
+    module: str  # has the class SIMULATOR
+    about: str  # what it is, in a line
+    scene: str  # an example of a scene's name
+    needs: tuple[str, ...] = ()  # modules that are not always installed
+    install: str = ''  # the command that installs them
+
+
+TABLE = {
+    'house': Entry('vn_sim_bridge.simulators.house', 'procedural houses, drawn by this package',
+                   'house:7?rooms=5'),
+    'bag': Entry('vn_sim_bridge.simulators.recorded',
+                 'the pictures of a recorded drive (depth where it has some)', 'bag:my_drive'),
+}
+
+
+def table() -> dict[str, Entry]:
+    """The rows of this package, and those that entry points add."""
+    found = dict(TABLE)
+    for point in importlib.metadata.entry_points(group=GROUP):
+        about = f'of the package {point.dist.name}' if point.dist else 'an entry point'
+        found.setdefault(point.name, Entry(point.value, about, f'{point.name}:...'))
+    return found
+
+
+def missing(entry: Entry) -> list[str]:
+    """What a simulator needs and this machine lacks."""
+    return [name for name in entry.needs if importlib.util.find_spec(name) is None]
+
+
+def simulator_class(name: str) -> type[BaseSimulator]:
+    """The class of a simulator.
+
+    Args:
+        name: of a row, or of a module with a dot in it.
+
+    Raises:
+        UserError: there is none, or something is missing here.
+    """
+    known = table()
+    if name in known:
+        entry = known[name]
+        if lacking := missing(entry):
+            raise UserError(f'the simulator {name} needs {", ".join(lacking)}', 'not installed',
+                            entry.install)
+        module = entry.module
+    elif '.' in name:
+        module = name
+    else:
+        raise UserError(f'a simulator is one of: {", ".join(known)}, or a module such as '
+                        'examples.corridor', name, 'choose one (vn_nav simulators)')
+    try:
+        return importlib.import_module(module).SIMULATOR
+    except ModuleNotFoundError as error:
+        raise UserError(f'the simulator {name} is a module that Python finds', str(error),
+                        'install its package, or put its folder on PYTHONPATH') from error
+    except AttributeError as error:
+        raise UserError(f'the module {module} has a class SIMULATOR', str(error),
+                        'name one on BaseSimulator so') from error
+
+
+def open_simulator(scenes: Sequence[str], setup: Setup) -> Simulator:
+    """The simulator of some scenes.
+
+    Args:
+        scenes: names, all of one simulator; see `vn_nav.scenes`.
+        setup: robots, camera, pictures.
+
+    Raises:
+        UserError: scenes of several simulators, or one that there is not.
+    """
+    name, parsed = one_simulator(scenes)
+    return simulator_class(name).open(parsed, setup)

@@ -1,4 +1,4 @@
-"""The embedded houses as a backend."""
+"""Embedded houses: `house:SEED`, `house:SEED?rooms=N`."""
 
 from __future__ import annotations
 
@@ -8,56 +8,112 @@ import numpy as np
 
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
+from vn_nav.scenes import ROOMS, SceneName, house_scene, options_of, whole_number
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.floor.contacts import WORLD_VERSION, World
+from vn_sim_bridge.floor.contacts import World
 from vn_sim_bridge.houses.house import House
+from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.objects import object_scene
-from vn_sim_bridge.navigation.tasks import Placed
-from vn_sim_bridge.render.pack import Lights, Objects, no_objects
+from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.houses.splits import SPLITS
+from vn_sim_bridge.render.pack import Lights
 from vn_sim_bridge.render.randomisation import Appearance, Randomisation, draw_appearance
 from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.sensor import expose
-from vn_sim_bridge.simulator import Capabilities, Frames, Motion
+from vn_sim_bridge.simulator import (
+    BaseSimulator,
+    Capabilities,
+    Frames,
+    Motion,
+    Objects,
+    Placed,
+    Setup,
+    no_objects,
+)
 
 
-class HouseBackend:
-    """N robots in embedded houses (see `Backend`).
+class ScenesBySeed(Sequence):
+    """Names of houses, made when they are asked for: a split has thousands."""
+
+    def __init__(self, seeds: range):
+        self._seeds = seeds
+
+    def __len__(self) -> int:
+        return len(self._seeds)
+
+    def __getitem__(self, index):
+        found = self._seeds[index]
+        return ScenesBySeed(found) if isinstance(found, range) else house_scene(found)
+
+
+def open_houses(scenes: Sequence[SceneName], goals_per_room: int = 1, goal_seed: int = 0
+                ) -> list[House]:
+    """The houses of some scenes.
+
+    Raises:
+        UserError: a scene that is no house.
+    """
+    return [generate_house(
+        whole_number(scene, 'seed', scene.place),
+        rooms=whole_number(scene, 'number of rooms',
+                           options_of(scene, ('rooms',)).get('rooms', str(ROOMS))),
+        goals_per_room=goals_per_room, goal_seed=goal_seed) for scene in scenes]
+
+
+# Pixels, houses and motion together. Whoever changes one of them raises it and trains the shipped
+# models again: a checkpoint is only worth its figures in the world that it was measured in.
+WORLD_VERSION = '2'
+
+
+class HouseSimulator(BaseSimulator):
+    """N robots in embedded houses (see `Simulator`).
 
     Args:
         houses: the houses.
-        house_index: [N] the house of each robot.
+        place_index: [N] the house of each robot.
         robot: footprint and camera.
         size: side of the square pictures [pixels].
         threads: threads that draw.
-        randomisation: what `dress` draws light and camera from; default: nothing varies.
+        randomisation: what `apply_appearance` draws light and camera from; default: nothing
+            varies.
         models: names of the objects that may stand in the houses; objects: most at a time.
     """
 
     capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True,
-                                scene=True)
-    world_version = WORLD_VERSION
-    routes = None  # nothing keeps a robot from turning
+                                rooms=True, walls=True, placeable_objects=True, appearance=True,
+                                other_goals=True)
+    version = WORLD_VERSION
+    label_names = LABELS
+    splits = {name: ScenesBySeed(seeds) for name, seeds in SPLITS.items()}
 
-    def __init__(self, houses: Sequence[House], house_index: Sequence[int], *, robot: RobotSpec,
+    @classmethod
+    def open(cls, scenes: Sequence[SceneName], setup: Setup) -> HouseSimulator:
+        """See `BaseSimulator.open`."""
+        houses = open_houses(scenes, setup.goals_per_room, setup.goal_seed)
+        return cls(houses, np.arange(setup.num_envs) % len(houses), robot=setup.robot,
+                   size=setup.size, threads=setup.threads, randomisation=setup.randomisation,
+                   models=setup.models, objects=setup.objects)
+
+    def __init__(self, houses: Sequence[House], place_index: Sequence[int], *, robot: RobotSpec,
                  size: int = 84, threads: int = 1, randomisation: Randomisation | None = None,
                  models: Sequence[str] = (), objects: int = 0):
-        self.houses = list(houses)
-        for house in self.houses:
+        self.places = list(houses)
+        for house in self.places:
             if robot.footprint_radius > house.footprint_radius:
                 raise UserError('the robot fits into the floor map of the house '
                                 f'(footprint radius <= {house.footprint_radius} m)',
                                 robot.footprint_radius, 'use a smaller robot')
         self.robot = robot
-        self.world = World(self.houses, np.asarray(house_index), robot.footprint_radius)
-        self.num_envs = len(self.world.house_index)
+        self.world = World(self.places, np.asarray(place_index), robot.footprint_radius)
+        self.num_envs = len(self.world.place_index)
         self.randomisation = randomisation or Randomisation()
-        self._renderer = Rasterizer([*(house.scene for house in self.houses),
+        self._renderer = Rasterizer([*(house.scene for house in self.places),
                                      *map(object_scene, models)], size, threads=threads)
         self.objects = no_objects(self.num_envs, objects)
         self._all = np.arange(self.num_envs)
         self._frames = None
         self._appearance = None
-        self.dress(self._all, 0, Stream.APPEARANCE, self._all, 0 * self._all)
+        self.apply_appearance(self._all, 0, Stream.APPEARANCE, self._all, 0 * self._all)
 
     @property
     def poses(self) -> np.ndarray:
@@ -65,22 +121,9 @@ class HouseBackend:
         return self.world.poses
 
     @property
-    def house_index(self) -> np.ndarray:
+    def place_index(self) -> np.ndarray:
         """[N] the house of each robot."""
-        return self.world.house_index
-
-    @property
-    def seen_from(self) -> np.ndarray:
-        """[N,4]: pictures are drawn from where the robots are."""
-        return self.world.poses
-
-    def enter(self, env_ids: np.ndarray, houses: np.ndarray) -> None:
-        """Put robots [K] into houses [K]; their poses are still to be set."""
-        self.world.house_index[env_ids] = houses
-
-    def place(self, env_ids: np.ndarray, poses: np.ndarray) -> None:
-        """Put robots [K] at poses [K,4]."""
-        self.world.poses[env_ids] = poses
+        return self.world.place_index
 
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
         """Displace robots by [K,4] in their own frames, up to the first contact."""
@@ -95,8 +138,8 @@ class HouseBackend:
         return draw_appearance(self.randomisation, self._renderer.rooms, seed, stream, env,
                                episode)
 
-    def dress(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream, env,
-              episode) -> None:
+    def apply_appearance(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream,
+                         env, episode) -> None:
         """Draw light and camera of robots [K] anew, for the counters [K] of their episodes."""
         drawn = self.appearance(seed, stream, env, episode)
         if self._appearance is None:
@@ -107,20 +150,20 @@ class HouseBackend:
 
     def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
         """Put these objects, and no others, into the house of one robot."""
-        self._stand(self.objects, env_id, self.world.house_index[env_id], placed)
+        self._stand(self.objects, env_id, self.world.place_index[env_id], placed)
 
-    def _stand(self, objects: Objects, row: int, house_index: int, placed: Sequence[Placed]
+    def _stand(self, objects: Objects, row: int, place_index: int, placed: Sequence[Placed]
                ) -> None:
-        house = self.houses[house_index]
+        house = self.places[place_index]
         objects.scene[row] = -1
         for m, item in enumerate(placed):
-            objects.scene[row, m] = len(self.houses) + item.model
+            objects.scene[row, m] = len(self.places) + item.model
             objects.pose[row, m] = item.x, item.y, 0.0, item.yaw
             objects.room[row, m] = house.room_index(item.x, item.y)
 
     def object_models(self) -> np.ndarray:
         """[N,M] int64: which model each object is; -1: absent."""
-        return np.where(self.objects.scene >= 0, self.objects.scene - len(self.houses), -1)
+        return np.where(self.objects.scene >= 0, self.objects.scene - len(self.places), -1)
 
     def observe(self, env_ids: np.ndarray | None = None,
                 keys: np.ndarray | None = None) -> Frames:
@@ -131,17 +174,17 @@ class HouseBackend:
             keys: [K] uint64, of the sensor's noise; default: one noise for every call.
         """
         if env_ids is None:
-            self._frames = self._draw(self.world.house_index, self.world.poses, self._frames,
+            self._frames = self._draw(self.world.place_index, self.world.poses, self._frames,
                                       self._appearance, keys, self.objects)
             return self._frames
-        return self._draw(self.world.house_index[env_ids], self.world.poses[env_ids], None,
+        return self._draw(self.world.place_index[env_ids], self.world.poses[env_ids], None,
                           Appearance(*(part[env_ids] for part in self._appearance)), keys,
                           Objects(*(part[env_ids] for part in self.objects)))
 
-    def view(self, house_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
+    def view(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
              appearance: Appearance | None = None, keys: np.ndarray | None = None,
              placed: Sequence[Sequence[Placed]] | None = None) -> Frames:
-        """Pictures from any poses [K,4] in the given houses [K]; by default in standard light.
+        """Pictures from any poses [K,4] in houses [K]; by default in standard light.
 
         Args:
             out: buffers to fill; keys: as in `observe`.
@@ -155,8 +198,8 @@ class HouseBackend:
         if placed is not None:
             objects = no_objects(len(poses), max(map(len, placed)))
             for k, items in enumerate(placed):
-                self._stand(objects, k, house_index[k], items)
-        return self._draw(house_index, poses, out, appearance, keys, objects)
+                self._stand(objects, k, place_index[k], items)
+        return self._draw(place_index, poses, out, appearance, keys, objects)
 
     def cameras(self, poses: np.ndarray | None = None, appearance: Appearance | None = None
                 ) -> tuple[np.ndarray, np.ndarray]:
@@ -174,13 +217,20 @@ class HouseBackend:
                                    poses[:, 3] + robot.camera_pitch + appearance.pitch])
         return cameras, robot.camera_fov + appearance.fov
 
-    def _draw(self, house_index, poses, out, appearance, keys, objects) -> Frames:
+    def _draw(self, place_index, poses, out, appearance, keys, objects) -> Frames:
         cameras, fov = self.cameras(poses, appearance)
         frames = Frames(*self._renderer.render(
-            house_index, cameras, fov, out,
+            place_index, cameras, fov, out,
             lights=Lights(appearance.cube, appearance.lamps), objects=objects))
         if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:
             if keys is None:
                 keys = np.arange(len(poses)).astype(np.uint64)
             expose(frames.rgb, appearance.noise, appearance.blur, keys)
         return frames
+
+    def close(self) -> None:
+        """Let go of the pictures and of what the renderer holds."""
+        self._frames = self._renderer = None
+
+
+SIMULATOR = HouseSimulator

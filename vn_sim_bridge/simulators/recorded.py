@@ -1,16 +1,21 @@
-"""Recorded pictures as a backend: a robot sees the picture that was taken nearest to its pose."""
+"""A recorded drive, `bag:FOLDER`: a robot sees the picture that was taken nearest to its pose."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
+from vn_nav.scenes import SceneName, options_of
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.houses.house import CELL
+from vn_sim_bridge.floor.floor_map import CELL
 from vn_sim_bridge.recorded.image_graph import ImageGraph
 from vn_sim_bridge.recorded.pose_lattice import (
     FARTHEST,
@@ -22,15 +27,21 @@ from vn_sim_bridge.recorded.pose_lattice import (
     in_sight,
 )
 from vn_sim_bridge.recorded.relight import draw_light, relight
-from vn_sim_bridge.render.pack import no_objects
-from vn_sim_bridge.simulator import Capabilities, Frames, Motion
+from vn_sim_bridge.simulator import (
+    BaseSimulator,
+    Capabilities,
+    Frames,
+    Motion,
+    Setup,
+    cameras_at,
+)
 
 BUCKET = 0.5  # m, side of the squares that nodes are looked for in
 AS_GOOD = 0.5  # a node that is farther than the nearest one by no more may be shown instead
 SHARP = math.radians(0.5)  # rad: a picture is not turned by less
 
 
-class ImageGraphBackend:
+class RecordedSimulator(BaseSimulator):
     """N robots in a graph of recorded pictures (see `Simulator`).
 
     A robot sees the node nearest to its pose in the metric of `pose_lattice`, or one about as
@@ -47,33 +58,45 @@ class ImageGraphBackend:
             goals too, is as it was recorded.
     """
 
+    # Of a drive with depth pictures.
+    capabilities = Capabilities(continuous=True, depth=True, labels=False, geodesic=True,
+                                tilt=False)
+    version = 'recorded'  # unless a simulator drew the pictures: then its version
+
     def __init__(self, graph: ImageGraph, num_envs: int, *, robot: RobotSpec, draw: bool = True,
                  light: bool = False):
-        self.houses, self.graph, self.robot, self.num_envs = [graph], graph, robot, num_envs
-        self.capabilities = Capabilities(
-            continuous=True, depth=graph.depth is not None, labels=False, geodesic=True,
-            tilt=False)
-        self.world_version = graph.world_version
-        self.poses = np.zeros((num_envs, 4))
+        super().__init__([graph], Setup(num_envs, robot, graph.pictures.shape[-1]))
+        self.graph = graph
+        self.capabilities = dataclasses.replace(
+            self.capabilities, depth=graph.depth is not None)
+        self.version = graph.world_version
         self.poses[:, :3] = graph.poses[0]
-        self.house_index = np.zeros(num_envs, np.int64)
-        self.objects = no_objects(num_envs, 0)
-        self.routes = graph.map
+        self.planner = graph.map
         self._draw = draw
         self._light = (np.tile(np.arange(256, dtype=np.uint8), (num_envs, 3, 1)) if light
                        else None)
         self._index = _make_index(graph.poses)
         self._node = np.zeros(num_envs, np.int64)  # that was shown last
-        self.seen_from = self.poses.copy()
+        self._seen_from = self.poses.copy()
         self._blank = np.zeros((num_envs, *graph.pictures.shape[2:]), np.uint8)
-        self._all = np.arange(num_envs)
 
-    def enter(self, env_ids: np.ndarray, houses: np.ndarray) -> None:
-        """There is one place."""
+    @classmethod
+    def open(cls, scenes: Sequence[SceneName], setup: Setup) -> RecordedSimulator:
+        """See `BaseSimulator.open`; the drive is read as `vn_nav teach` reads it."""
+        for scene in scenes:
+            options_of(scene, ())
+        if len(scenes) != 1:
+            raise UserError('robots drive in one recorded drive', ', '.join(map(str, scenes)),
+                            'name one bag')
+        if setup.models or setup.goal_seed or setup.goals_per_room != 1:
+            raise UserError('a recorded drive has the goals that it shows, and no objects',
+                            str(scenes[0]), 'leave out other goals and objects')
+        return cls(read_graph(scenes[0], setup), setup.num_envs, robot=setup.robot)
 
-    def place(self, env_ids: np.ndarray, poses: np.ndarray) -> None:
-        """Put robots [K] at poses [K,4]."""
-        self.poses[env_ids] = poses
+    @property
+    def seen_from(self) -> np.ndarray:
+        """[N,4] where the last pictures were taken."""
+        return self._seen_from
 
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
         """Displace robots by [K,4] in their own frames, up to where no picture is near."""
@@ -96,22 +119,12 @@ class ImageGraphBackend:
         poses[:, 2] = headings
         return self.graph.map.drive(poses, np.array([[length, 0.0, 0.0]] * len(poses)))[0][:, :2]
 
-    def appearance(self, seed: int, stream: Stream, env, episode) -> None:
-        """Of views: light and camera are as they were recorded."""
-
-    def dress(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream, env,
-              episode) -> None:
+    def apply_appearance(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream,
+                         env, episode) -> None:
         """Draw the light of episodes."""
         if self._light is not None:
             env, episode = (np.broadcast_to(part, env_ids.shape) for part in (env, episode))
             self._light[env_ids] = draw_light(seed, stream, env, episode)
-
-    def set_objects(self, env_id: int, placed) -> None:
-        """There are none."""
-
-    def object_models(self) -> np.ndarray:
-        """[N,0]: none."""
-        return self.objects.scene
 
     def observe(self, env_ids: np.ndarray | None = None,
                 keys: np.ndarray | None = None) -> Frames:
@@ -126,14 +139,14 @@ class ImageGraphBackend:
         nodes = self._nearest(poses, keys if self._draw else None)
         self._node[env_ids] = nodes
         # In place of the node the robot stands where its picture was taken, but as it is turned.
-        self.seen_from[env_ids] = poses
-        self.seen_from[env_ids, :2] = self.graph.poses[nodes, :2]
+        self._seen_from[env_ids] = poses
+        self._seen_from[env_ids, :2] = self.graph.poses[nodes, :2]
         frames = self._frames(nodes, poses[:, 2])
         if self._light is not None:
             relight(frames.rgb, self._light[env_ids])
         return frames
 
-    def view(self, house_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
+    def view(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
              appearance: None = None, keys: np.ndarray | None = None, placed=None) -> Frames:
         """The pictures nearest to poses [K,4], turned to their headings."""
         return self._frames(self._nearest(poses, None), poses[:, 2])
@@ -143,9 +156,9 @@ class ImageGraphBackend:
         """Cameras [K,5] and fov [K] of poses [K,4], or behind the depth that robots saw last."""
         return cameras_at(self.graph.poses[self._node] if poses is None else poses, self.robot)
 
-    def overlap(self, goal_poses: np.ndarray) -> np.ndarray:
+    def co_visibility(self, goal_poses: np.ndarray) -> np.ndarray:
         """What poses alone say of what robots and goals [N,4] both show, see `ImageGraph`."""
-        return self.graph.overlap(self.seen_from, goal_poses, self.robot.camera_fov)
+        return self.graph.co_visibility(self.seen_from, goal_poses, self.robot.camera_fov)
 
     def _nearest(self, poses: np.ndarray, keys: np.ndarray | None) -> np.ndarray:
         draw = keys is not None
@@ -166,12 +179,19 @@ class ImageGraphBackend:
         return Frames(rgb, depth, blank[:count], blank[:count].astype(np.uint16))
 
 
-def cameras_at(poses: np.ndarray, robot: RobotSpec) -> tuple[np.ndarray, np.ndarray]:
-    """The cameras [K,5] and fov [K] of robots at poses [K,>=3], see `co_visibility.lift`."""
-    count = len(poses)
-    return (np.column_stack([poses[:, :2], np.full(count, robot.camera_height), poses[:, 2],
-                             np.full(count, robot.camera_pitch)]),
-            np.full(count, robot.camera_fov))
+def read_graph(scene: SceneName, setup: Setup) -> ImageGraph:
+    """The place of a recorded drive.
+
+    Raises:
+        UserError: no bag, or one that is no place to drive in.
+    """
+    import tempfile
+
+    from vn_nav.bags.mapping.recorded_place import PlaceOptions, read_place
+    from vn_sim_bridge.recorded.image_graph import build_graph
+    with tempfile.TemporaryDirectory() as decoded:
+        return read_place(Path(scene.place), PlaceOptions(), build_graph, setup.robot, setup.size,
+                          Path(decoded))
 
 
 def turned(pictures: np.ndarray, yaw: np.ndarray, robot: RobotSpec) -> np.ndarray:
@@ -181,6 +201,9 @@ def turned(pictures: np.ndarray, yaw: np.ndarray, robot: RobotSpec) -> np.ndarra
     focal = pictures.shape[-1] / 2 / math.tan(robot.camera_fov / 2)
     _turn(pictures, yaw, robot.camera_pitch, focal, out)
     return out
+
+
+SIMULATOR = RecordedSimulator
 
 
 class _Index(NamedTuple):

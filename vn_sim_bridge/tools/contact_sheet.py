@@ -13,7 +13,7 @@ from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.render.randomisation import Randomisation
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulators.house import HouseSimulator
 
 VIEW = 200  # pixels a side of a view
 COLUMNS = 6
@@ -37,17 +37,17 @@ def contact_sheet(house: House, randomisation: Randomisation | None = None, *,
     Returns:
         [H,W,3] uint8 RGB.
     """
-    backend = HouseBackend([house], [0], robot=RobotSpec(), size=VIEW,
-                           randomisation=randomisation)
+    simulator = HouseSimulator([house], [0], robot=RobotSpec(), size=VIEW,
+                               randomisation=randomisation)
     rng = np.random.default_rng(seed)
     views = max(0, pictures - len(house.goals))
     centres = house.floor.centres()
     random = np.column_stack([centres[rng.integers(len(centres), size=views)],
                               rng.uniform(-math.pi, math.pi, views), np.zeros(views)])
     poses = np.concatenate([[goal.pose for goal in house.goals], random])
-    looks = backend.appearance(seed, Stream.APPEARANCE, np.arange(len(poses)), 0)
-    tiles = backend.view(np.zeros(len(poses), np.int64), poses, None,
-                         looks).rgb.transpose(0, 2, 3, 1)
+    looks = simulator.appearance(seed, Stream.APPEARANCE, np.arange(len(poses)), 0)
+    tiles = simulator.view(np.zeros(len(poses), np.int64), poses, None,
+                           looks).rgb.transpose(0, 2, 3, 1)
     blank = np.full((-len(tiles) % COLUMNS, VIEW, VIEW, 3), PAPER, np.uint8)
     tiles = np.concatenate([tiles, blank])
     rows = [np.concatenate(list(tiles[k:k + COLUMNS]), axis=1)

@@ -19,7 +19,7 @@ from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.render.randomisation import Randomisation
-from vn_sim_bridge.simulators.house import HouseBackend
+from vn_sim_bridge.simulators.house import HouseSimulator
 
 STEP, TURN = 0.25, math.radians(15)  # m, rad a key
 VIEW = 512  # pixels of the window
@@ -43,29 +43,29 @@ class Walk:
 
     def __init__(self, house: House, size: int, randomisation: Randomisation | None = None):
         self.house, self.lights, self.touched = house, 0, False
-        self.backend = HouseBackend([house], [0], robot=RobotSpec(), size=size,
-                                    randomisation=randomisation)
+        self.simulator = HouseSimulator([house], [0], robot=RobotSpec(), size=size,
+                                        randomisation=randomisation)
         x, y, yaw, _ = house.goals[0].pose
-        self.backend.place(np.array([0]), np.array([[x, y, yaw, 0.0]]))
+        self.simulator.place(np.array([0]), np.array([[x, y, yaw, 0.0]]))
 
     def press(self, key: str) -> bool:
         """Act on a key; False when it means to leave."""
         if key in ('x', '\x03', '\x04'):
             return False
         if key in KEYS:
-            motion = self.backend.move(np.array([KEYS[key]], float))
+            motion = self.simulator.move(np.array([KEYS[key]], float))
             self.touched = bool(motion.collided[0])
         elif key == 'l':
             self.lights += 1
-            self.backend.dress(np.array([0]), 0, Stream.APPEARANCE, 0, self.lights)
+            self.simulator.apply_appearance(np.array([0]), 0, Stream.APPEARANCE, 0, self.lights)
         return True
 
     def look(self) -> tuple[np.ndarray, str]:
         """What the robot sees, [S,S,3] uint8 RGB; where it is and what it looks at."""
-        frames = self.backend.observe()
+        frames = self.simulator.observe()
         picture = np.ascontiguousarray(frames.rgb[0].transpose(1, 2, 0))
         middle = frames.depth.shape[1] // 2
-        x, y, yaw, pitch = self.backend.poses[0]
+        x, y, yaw, pitch = self.simulator.poses[0]
         seen = LABELS[frames.labels[0, middle, middle]].replace('_', ' ')
         status = (f'{self.house.room_at(x, y) or "doorway"}   x {x:.2f}  y {y:.2f} m  '
                   f'heading {math.degrees(yaw):.0f}  tilt {0.0 - math.degrees(pitch):.0f} deg   '

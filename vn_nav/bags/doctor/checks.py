@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.doctor.figures import (
@@ -226,7 +227,7 @@ class _Doctor:
                       f'{lens[1]} x {lens[2]}', at, 'calibrate the camera (camera_calibration): '
                       'pictures cannot be cropped to what a policy knows')
         elif self._fov is not None:
-            fov = 2 * math.atan(min(lens[1:]) / 2 / lens[0])
+            fov = field_of_view(*lens[1:], lens[0])
             try:
                 crop_fraction(fov, self._fov)
             except UserError as error:

@@ -100,7 +100,8 @@ def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: R
     return build_graph(
         part.drives.image, poses, _episodes(part), robot, depth=part.drives.depth,
         farthest=MAX_DEPTH, goals=options.goals, goal_pictures=drives.goals, **margin,
-        world_version=str(scene_of(bag).get('world_version', RECORDED)))
+        world_version=str(scene_of(bag).get('world_version', RECORDED)),
+        name=f'bag:{bag}')
 
 
 def _episodes(part: Part) -> np.ndarray:

@@ -24,7 +24,7 @@ from vn_nav.bags.storage.records import BagError, Connection, Message
 MAX_DEFINITION = 256 << 10  # bytes; the longest of Jazzy and MoveIt have about 100 kB
 MAX_UNROLLED = 4096  # elements of a fixed array for which code is generated one by one
 MAX_FIXED = 64 << 20  # bytes that a message has at least
-MAX_DEPTH = 32  # of types within types
+MAX_NESTING = 32  # of types within types
 # A list of numbers is one array, whatever its length; of anything else each element is a Python
 # object, a hundred times larger than its bytes can be.
 MAX_OBJECTS = 2_000_000
@@ -174,7 +174,7 @@ def _least(name: str, types: dict, known: dict[str, tuple[int, int]], depth: int
     """
     if name in known:
         return known[name]
-    if depth > MAX_DEPTH:
+    if depth > MAX_NESTING:
         raise _Unusable(f'its definition has types within types, or within itself: {name}')
     if name not in types:
         raise _Unusable(f'its definition lacks {name}')

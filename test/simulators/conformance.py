@@ -1,0 +1,307 @@
+"""What every simulator keeps: inherit `Conformance`, write `make`, and its tests run."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from vn_nav.co_visibility import co_visible, lift
+from vn_nav.errors import UserError
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.scenes import parse_scene
+from vn_sim_bridge.counter_random import Stream, key
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
+from vn_sim_bridge.simulator import Capabilities, Simulator
+
+ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
+SIZE = 24
+GROWTH_MB = 24  # of 8,000 steps; one leaked picture a step would be 55
+
+
+def resident_mb():
+    with open('/proc/self/status') as status:
+        line = next(line for line in status if line.startswith('VmRSS'))
+    return int(line.split()[1]) / 1024
+
+
+class Conformance:
+    """The contract of `vn_sim_bridge.simulator.Simulator`, as tests."""
+
+    actions = DRIVE_ACTIONS
+    contact_slack = 0.02  # m that a robot may still creep towards what it touches
+    depth_slack = 0.9  # share of a picture's points that the same pose sees again
+
+    def make(self, num_envs, size=SIZE):
+        """A new simulator of `num_envs` robots with pictures of `size` pixels."""
+        raise NotImplementedError
+
+    def config(self, num_envs, **options):
+        """Of an environment about it."""
+        return EnvConfig(num_envs=num_envs, size=SIZE, actions=self.actions, **options)
+
+    def env(self, num_envs=3, **options):
+        return NavigationEnv(self.config(num_envs, **options), ROBOT,
+                             simulator=self.make(num_envs))
+
+    @pytest.fixture
+    def shared(self):
+        """A simulator with its robots at starts, for tests that look alone or put them back."""
+        simulator = self.make(4)
+        yield simulator
+        simulator.close()
+
+    def put(self, simulator, turned=0.0):
+        """Put every robot at a start of its place; the poses [N,4]."""
+        poses = np.zeros((simulator.num_envs, 4))
+        for n in range(simulator.num_envs):
+            cells, headings = simulator.places[simulator.place_index[n]].starts()
+            k = (n * 7919 + 13) % len(cells)
+            poses[n, :2] = cells[k]
+            poses[n, 2] = 0.4 * n if headings is None else headings[k]
+        poses[:, 2] += turned
+        simulator.place(np.arange(simulator.num_envs), poses)
+        return simulator.poses.copy()
+
+    def drive(self, simulator, seed=0, steps=12):
+        """Random moves; all that came of them."""
+        rng, found = np.random.default_rng(seed), []
+        self.put(simulator)
+        for step in range(steps):
+            delta = np.zeros((simulator.num_envs, 4))
+            kind = rng.integers(0, len(ROBOT.actions), simulator.num_envs)
+            for n, action in enumerate(ROBOT.actions[k] for k in kind):
+                delta[n] = action.dx, action.dy, action.dyaw, action.dpitch
+            motion = simulator.move(delta)
+            frames = simulator.observe(keys=key(seed, Stream.SENSOR, np.arange(
+                simulator.num_envs), 0, step))
+            found += [motion.delta.copy(), motion.collided.copy(), simulator.poses.copy(),
+                      *(part.copy() for part in frames)]
+        return found
+
+    def test_it_has_all_of_the_protocol(self, shared):
+        assert isinstance(shared, Simulator)
+        assert isinstance(shared.version, str) and shared.version
+        assert isinstance(shared.capabilities, Capabilities)
+        assert all(type(value) is bool for value in dataclasses.astuple(shared.capabilities))
+        assert not (shared.capabilities.labels and len(shared.label_names) == 0)
+        for split, scenes in getattr(shared, 'splits', {}).items():
+            assert split and len(scenes) and str(parse_scene(scenes[0])) == scenes[0]
+
+    def test_spaces(self, shared):
+        n = shared.num_envs
+        poses = self.put(shared)
+        assert poses.shape == (n, 4) and poses.dtype == np.float64
+        assert shared.place_index.shape == shared.seen_from.shape[:1] == (n,)
+        assert shared.objects.scene.shape == shared.object_models().shape
+        frames = shared.observe()
+        for part, shape, dtype in zip(frames, ((n, 3, SIZE, SIZE), *[(n, SIZE, SIZE)] * 3),
+                                      (np.uint8, np.float32, np.uint8, np.uint16), strict=True):
+            assert part.shape == shape and part.dtype == dtype
+        some = shared.observe(np.array([2, 0]))
+        assert some.rgb.shape == (2, 3, SIZE, SIZE)
+        cameras, fov = shared.cameras()
+        assert cameras.shape == (n, 5) and np.shape(fov) == (n,) and np.isfinite(cameras).all()
+        env = self.env(2)
+        observation, info = env.reset(seed=1)
+        assert env.observation_space.contains(observation)
+        assert np.isfinite(info['distance']).all()
+        env.close()
+
+    def test_places_have_goals_and_starts(self, shared):
+        for place in shared.places:
+            assert str(parse_scene(place.name)) == place.name
+            cells, headings = place.starts()
+            assert cells.ndim == 2 and cells.shape[1] == 2 and np.isfinite(cells).all()
+            assert headings is None or headings.shape == (len(cells),)
+            assert len(place.goals) >= 1
+            goal = place.goals[0]
+            distance = place.distance_to(goal)
+            assert (distance is not None) == shared.capabilities.geodesic
+            if distance is not None:
+                far = distance.at(cells)
+                straight = np.hypot(*(cells - goal.pose[:2]).T)
+                there = np.isfinite(far)
+                assert there.any() and distance.at(np.array([goal.pose]))[0] <= 0.15
+                assert (far[there] >= straight[there] - 0.15).all()
+                assert far[there].max() <= distance.maximum + 0.15
+            plan = place.plan()
+            assert plan is None or {'bounds', 'goals', 'walls', 'outside', 'obstacles',
+                                    'rooms_list', 'area'} <= plan.keys()
+
+    def test_robots_are_where_they_are_put(self, shared):
+        poses = self.put(shared)
+        shared.place(np.array([1]), poses[[2]])
+        assert np.array_equal(shared.poses[[0, 2, 3]], poses[[0, 2, 3]])
+        assert np.array_equal(shared.poses[1], poses[2])
+        self.put(shared)
+        motion = shared.move(np.zeros((4, 4)))
+        assert not motion.collided.any() and not motion.delta.any()
+        assert np.allclose(shared.poses, poses)
+
+    def test_moves_are_what_they_say(self, shared):
+        for delta in ([0.0, 0.0, 0.5, 0.0], [0.1, 0.0, 0.0, 0.0], [-0.1, 0.0, 0.0, 0.0]):
+            before = self.put(shared)
+            env_ids = np.array([0, 3])
+            motion = shared.move(np.array([delta, delta]), env_ids)
+            assert motion.delta.shape == (2, 4) and motion.collided.shape == (2,)
+            after = shared.poses
+            assert np.array_equal(after[[1, 2]], before[[1, 2]])  # nobody else has moved
+            heading = before[env_ids, 2] + motion.delta[:, 2] / 2
+            c, s = np.cos(heading), np.sin(heading)
+            dx, dy = motion.delta[:, 0], motion.delta[:, 1]
+            want = before[env_ids, :2] + np.stack([c * dx - s * dy, s * dx + c * dy], 1)
+            assert np.allclose(after[env_ids, :2], want, atol=1e-6)
+            turned = after[env_ids, 2] - before[env_ids, 2] - motion.delta[:, 2]
+            assert np.allclose(np.sin(turned / 2), 0, atol=1e-6)
+            whole = np.abs(motion.delta - delta).max(axis=1) < 1e-6
+            assert (whole | motion.collided).all()
+
+    def test_a_move_ends_at_the_first_contact(self, shared):
+        self.put(shared)
+        for _ in range(200):
+            before = shared.poses.copy()
+            motion = shared.move(np.array([[0.5, 0.0, 0.0, 0.0]] * 4))
+            gone = np.hypot(*(shared.poses[:, :2] - before[:, :2]).T)
+            assert np.allclose(gone, np.hypot(*motion.delta[:, :2].T), atol=1e-6)
+            assert (gone <= 0.5 + 1e-9).all() and (motion.collided == (gone < 0.5 - 1e-9)).all()
+            if motion.collided.all():
+                break
+        assert motion.collided.all(), 'a place has an end'
+        at = shared.poses.copy()
+        again = shared.move(np.array([[0.5, 0.0, 0.0, 0.0]] * 4))
+        assert again.collided.all()
+        assert np.hypot(*again.delta[:, :2].T).max() <= self.contact_slack
+        shared.place(np.arange(4), at)
+
+    def test_reach_says_where_a_move_would_end(self, shared):
+        poses = self.put(shared)
+        headings = np.linspace(-3, 3, 5) if shared.places[0].starts()[1] is None else (
+            poses[0, 2] + np.array([0.0, 0.05]))
+        ends = shared.reach(0, headings, 0.5)
+        assert np.array_equal(shared.poses, poses)  # nobody has moved
+        for heading, end in zip(headings, ends, strict=True):
+            shared.place(np.array([0]), np.array([[*poses[0, :2], heading, 0.0]]))
+            shared.move(np.array([[0.5, 0.0, 0.0, 0.0]]), np.array([0]))
+            assert np.allclose(shared.poses[0, :2], end, atol=1e-3)
+
+    def test_the_same_is_the_same_again(self):
+        one, two = self.make(3), self.make(3)
+        first, second = self.drive(one), self.drive(two)
+        assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+        assert all(np.array_equal(a, b)
+                   for a, b in zip(self.drive(one), first, strict=True))  # and from the start
+        one.close()
+        two.close()
+
+    def test_a_view_moves_nobody(self, shared):
+        poses = self.put(shared)
+        seen = shared.view(shared.place_index, poses)
+        assert seen.rgb.shape == (4, 3, SIZE, SIZE)
+        assert np.array_equal(shared.poses, poses)
+        assert np.array_equal(seen.rgb, shared.view(shared.place_index, poses).rgb)
+
+    def test_appearance_is_a_function_of_the_counter(self, shared):
+        self.put(shared)
+        everyone = np.arange(4)
+        shared.apply_appearance(everyone, 5, Stream.APPEARANCE, everyone, 3)
+        first = shared.observe().rgb.copy()
+        shared.apply_appearance(everyone, 6, Stream.APPEARANCE, everyone, 4)
+        shared.apply_appearance(everyone, 5, Stream.APPEARANCE, everyone, 3)
+        assert np.array_equal(shared.observe().rgb, first)
+
+    def test_depth_is_of_the_geometry(self, shared):
+        poses = self.put(shared)
+        depth = shared.observe().depth.copy()
+        if not shared.capabilities.depth:
+            assert not depth.any()
+            return
+        assert (depth >= 0).all() and (depth > 0).mean() > 0.5
+        points = lift(depth, *shared.cameras())
+        again = co_visible(points, shared.observe().depth, *shared.cameras())
+        assert (again >= self.depth_slack).all()
+        # A little ahead the same points are nearer, where the map says they are.
+        shared.move(np.array([[0.2, 0.0, 0.0, 0.0]] * 4))
+        ahead = shared.observe().depth
+        moved = np.hypot(*(shared.poses[:, :2] - poses[:, :2]).T) > 0.15
+        share = co_visible(points, ahead, *shared.cameras())
+        assert not moved.any() or np.median(share[moved]) > 0.4
+
+    def test_labels_have_names(self, shared):
+        self.put(shared)
+        labels = shared.observe().labels
+        if shared.capabilities.labels:
+            assert labels.max() < len(shared.label_names) and len(np.unique(labels)) > 1
+        else:
+            assert not labels.any()
+
+    def test_what_it_cannot_do_is_refused(self):
+        told = {'depth': ('depth',), 'labels': ('segmentation',), 'walls': ('explorer_action',)}
+        simulator = self.make(2)
+        for name, privileged in told.items():
+            if not getattr(simulator.capabilities, name):
+                with pytest.raises(UserError):
+                    NavigationEnv(self.config(2, privileged=privileged), ROBOT,
+                                  simulator=simulator)
+        if not simulator.capabilities.tilt:
+            with pytest.raises(UserError, match='camera'):
+                NavigationEnv(dataclasses.replace(self.config(2), actions=(
+                    'forward', 'rotate_left', 'look_up')), simulator=simulator)
+        for name, task in (('rooms', 'room'), ('placeable_objects', 'object')):
+            if not getattr(simulator.capabilities, name):
+                with pytest.raises(UserError, match=task):
+                    NavigationEnv(self.config(2, task=task), ROBOT, simulator=simulator)
+        simulator.close()
+
+    def test_episodes_end_and_begin(self):
+        env = self.env(3, max_decisions=4)
+        env.reset(seed=2)
+        ended = np.zeros(3, bool)
+        for step in range(12):
+            _, _, terminated, truncated, info = env.step(np.full(3, step % 2 + 2))
+            assert not (terminated & truncated).any()
+            assert (info['decisions'][truncated] == 4).all()
+            assert info['reset'][ended].all() and not info['reset'][~ended].any()
+            ended = terminated | truncated
+        env.close()
+
+    def test_a_state_goes_on_as_before(self):
+        one, two = self.env(3, max_decisions=9), self.env(3, max_decisions=9)
+        assert one.restorable
+        rng = np.random.default_rng(4)
+        one.reset(seed=3)
+        for _ in range(5):
+            one.step(rng.integers(0, len(self.actions), 3))
+        two.reset(seed=8)
+        two.set_state(one.get_state())
+        for _ in range(14):
+            actions = rng.integers(0, len(self.actions), 3)
+            (a, reward, *ends, told), (b, other, *also, too) = one.step(actions), two.step(actions)
+            assert all(np.array_equal(a[name], b[name]) for name in a)
+            assert np.array_equal(reward, other) and np.array_equal(ends, also)
+            assert all(np.array_equal(told[name], too[name]) for name in told)
+        one.close()
+        two.close()
+
+    def test_it_closes_once_and_for_all(self):
+        simulator, calls = self.make(2), []
+        close = simulator.close
+        simulator.close = lambda: (calls.append(1), close())
+        env = NavigationEnv(self.config(2), ROBOT, simulator=simulator)
+        env.close()
+        env.close()
+        assert calls == [1]
+        close()  # a second time it does nothing
+
+    @pytest.mark.slow
+    @pytest.mark.timeout(600)
+    def test_ten_thousand_steps_do_not_grow(self):
+        env = self.env(4, max_decisions=50)
+        env.reset(seed=0)
+        rng = np.random.default_rng(0)
+        for step in range(10_000):
+            env.step(rng.integers(0, len(self.actions), 4))
+            if step == 2_000:
+                begun = resident_mb()
+        assert resident_mb() - begun < GROWTH_MB
+        env.close()

@@ -1,0 +1,43 @@
+"""`vn_nav simulators`: what there is, what each can do, what is missing here."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import textwrap
+
+from vn_nav.errors import UserError
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """It has none."""
+
+
+
+def run(args: argparse.Namespace) -> int:
+    """`vn_nav simulators`: what there is, what each can do, what is missing here."""
+    from vn_sim_bridge.simulators import missing, simulator_class, table
+
+    def say(label: str, words: str) -> None:
+        print(textwrap.fill(words, 79, initial_indent=f'  {label:<8}', subsequent_indent=' ' * 10,
+                            break_long_words=False, break_on_hyphens=False))
+
+    for name, entry in table().items():
+        print(textwrap.shorten(f'{name}: {entry.about}', 79))
+        say('scene', entry.scene)
+        if lacking := missing(entry):
+            say('missing', f'{", ".join(lacking)}: {entry.install}')
+            continue
+        try:
+            kind = simulator_class(name)
+        except UserError as error:  # an entry point that leads nowhere
+            say('missing', str(error))
+            continue
+        can = [field.name.replace('_', ' ') for field in
+               dataclasses.fields(kind.capabilities) if getattr(kind.capabilities, field.name)]
+        say('can', ', '.join(can))
+        if kind.splits:
+            say('splits', ', '.join(f'{split} ({len(scenes):,})'
+                                    for split, scenes in kind.splits.items()))
+        say('version', kind.version)
+    return 0

@@ -1,0 +1,68 @@
+"""What trainer and evaluator use of an environment; three keep it.
+
+`NavigationEnv` (any simulator, on the CPU), `WarpNavigationEnv` (houses, on a device: its rows are
+tensors) and `RosEnv` (robots behind topics). N environments step together, with Gymnasium's
+NEXT_STEP autoreset: the step after an episode's end ignores its action and returns the first
+observation of the next episode; `info['reset']` marks these rows, which are no frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+from vn_nav.robot import RobotSpec
+
+
+@runtime_checkable
+class NavigationVectorEnv(Protocol):
+    """What a training needs.
+
+    Observations: `image` [N,3,S,S] uint8, `goal_index` [N] int64 into `goals`, `last_action` [N]
+    int64 (-1 at an episode's start), `last_reward` [N] float32 (the sparse reward alone).
+    `info` has at least `reset`, `success`, `collided` and `arrived`, each [N] bool, and the
+    privileged outputs that were asked for.
+    """
+
+    num_envs: int  # N
+    action_names: Sequence[str]
+    robot: RobotSpec
+    goals: Any  # [G,3,S,S] uint8, array or tensor
+    world_version: str  # of the simulator
+    simulator_name: str  # as scenes name it
+    restorable: bool  # `get_state` and `set_state` are there and work
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        """Begin new episodes: observations and info."""
+
+    def step(self, actions: Any) -> tuple[dict, Any, Any, Any, dict]:
+        """One decision each: observations, rewards, terminated, truncated [N], info."""
+
+    def set_difficulty(self, tau: float) -> None:
+        """Start later episodes within tau of the largest distance from their goals."""
+
+    def close(self) -> None:
+        """Let go of everything; a second time it does nothing."""
+
+
+@runtime_checkable
+class MeasuredVectorEnv(NavigationVectorEnv, Protocol):
+    """What an evaluation needs beside.
+
+    `info` then also has `distance`, `heading_error`, `start_distance` (NaN: nobody knows the
+    ways), `path_length`, `decisions`, `goal` and `pose`, by environment.
+    """
+
+    config: Any  # `task` and `stop`, as of `EnvConfig`
+    places: Sequence[Any]  # with `name` and `plan()`
+    place_index: Any  # [N] the place of each robot
+    goal_poses: Any  # [G,4] x, y [m], yaw, pitch [rad]
+    goal_rooms: Sequence[str]  # names of the goals
+    declare_action: int | None  # the action that says "I have arrived"; None: there is none
+    single_action_space: Any
+
+    def set_shown_goal(self, mode: str) -> None:
+        """Which picture later episodes show: 'right', 'wrong' or 'blank'."""
+
+    def oracle_actions(self) -> Any:
+        """[N] the next actions on shortest paths."""

@@ -1,0 +1,131 @@
+"""What a `NavigationEnv` simulates."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from vn_nav.errors import UserError
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.scenes import one_simulator
+from vn_sim_bridge.navigation.episodes import MIN_START_DISTANCE
+from vn_sim_bridge.render.randomisation import Randomisation
+from vn_sim_bridge.simulator import Simulator
+
+TASKS = ('image', 'object', 'room', 'collect')
+PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
+              'overlap', 'explorer_action', 'oracle_regret')
+STOPS = ('arrival', 'declared')
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """What a `NavigationEnv` simulates.
+
+    Environment i lives in scene i modulo their number. With more scenes than environments it draws
+    one of the scenes i, i + N, i + 2 N, ... for every episode.
+    """
+
+    scenes: tuple[str, ...] = ('house:0',)  # names, see `vn_nav.scenes`; all of one simulator
+    num_envs: int = 64
+    size: int = 84  # pixels
+    actions: tuple[str, ...] = DRIVE_ACTIONS
+    max_decisions: int = 300
+    noise: bool = True
+    progress_reward: float = 0.0  # per metre of geodesic progress
+    collision_reward: float = 0.0  # per decision that touched something; a penalty is negative
+    step_reward: float = 0.0  # per decision that does not reach the goal; a penalty is negative
+    goal_bonus: float = 0.0  # at the goal, beside the sparse reward
+    min_start_distance: float = MIN_START_DISTANCE  # m, geodesic
+    one_goal_per_env: bool = False  # environment i keeps pair i; else drawn each episode
+    seed: int = 0
+    goals_per_room: int = 1
+    task: str = 'image'  # of TASKS
+    objects: int = 1  # in a place at a time (object, collect)
+    room_must_see: bool = False  # the room rule of House3D's code, see tasks.RoomGoal
+    randomisation: Randomisation = Randomisation()
+    privileged: tuple[str, ...] = ()  # of PRIVILEGED
+    stop: str = 'arrival'  # of STOPS: an episode ends on arrival, or when the robot says so
+    goal_variants: int | None = None  # pictures of each goal; default: the randomisation's
+    goal_seed: int = 0  # 0: the scenes' own goals, else other ones in the same scenes
+    exploration_reward: float = 0.0  # per square of floor that is new to the episode, see SQUARE
+
+    def __post_init__(self):
+        one_simulator(self.scenes)
+        rules = (
+            (self.num_envs >= 1, 'there is at least one environment', self.num_envs),
+            (self.max_decisions >= 1, 'an episode has at least one decision', self.max_decisions),
+            (8 <= self.size <= 2048, 'pictures have 8 to 2048 pixels a side', self.size),
+            (self.task in TASKS, f'the task is one of {", ".join(TASKS)}', self.task),
+            (1 <= self.objects <= 16, 'there are 1 to 16 objects', self.objects),
+            (set(self.privileged) <= set(PRIVILEGED),
+             f'privileged outputs are some of {", ".join(PRIVILEGED)}', self.privileged),
+            (self.stop in STOPS, f'the stop is one of {", ".join(STOPS)}', self.stop),
+            (self.stop == 'arrival' or self.task == 'image',
+             'only the image task ends when the robot declares that it has arrived', self.task),
+            (self.goal_variants is None or 1 <= self.goal_variants <= 256,
+             'a goal has 1 to 256 pictures', self.goal_variants),
+            (self.goal_seed >= 0, 'the seed of goals is not negative', self.goal_seed),
+        )
+        for kept, rule, received in rules:
+            if not kept:
+                raise UserError(rule, received, 'correct the environment configuration')
+
+    @property
+    def pictures_per_goal(self) -> int:
+        """Differently lit pictures kept of each goal."""
+        return self.goal_variants or self.randomisation.pictures_per_goal
+
+
+def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *,
+                    given: bool = False) -> None:
+    """Whether a simulator can do what a configuration asks for.
+
+    Args:
+        given: the simulator was made elsewhere, with goals and light of its own.
+
+    Raises:
+        UserError: what it cannot do.
+    """
+    can, told = simulator.capabilities, set(config.privileged)
+    varies = config.randomisation.varies_pictures
+    own_goals = (config.goals_per_room, config.goal_seed) == (1, 0)
+    floors = all(getattr(place, 'floor', None) is not None for place in simulator.places)
+    image = config.task == 'image'
+    rules = (
+        (simulator.num_envs == config.num_envs, 'a simulator has as many robots as the '
+         f'configuration: {config.num_envs}', simulator.num_envs),
+        (can.rooms or config.task != 'room', 'task room needs a simulator that knows rooms',
+         config.task),
+        (can.placeable_objects or config.task not in ('object', 'collect'),
+         'this task needs a simulator that places objects', config.task),
+        (can.labels or not config.room_must_see, 'room_must_see needs labels', 'none'),
+        (image or not can.rewards, 'a simulator that pays itself has the task image',
+         config.task),
+        (config.stop == 'arrival' or not can.rewards,
+         'a simulator that pays itself ends its episodes', config.stop),
+        (can.geodesic or not config.progress_reward,
+         'progress_reward needs a simulator that knows ways', config.progress_reward),
+        (can.geodesic or simulator.planner or 'oracle_action' not in told,
+         'oracle_action needs a simulator that knows ways', 'oracle_action'),
+        (can.walls or 'explorer_action' not in told, 'the explorer needs a simulator that knows '
+         'walls', 'explorer_action'),
+        (floors or not config.exploration_reward,
+         'exploration_reward needs places with a floor map', config.exploration_reward),
+        (simulator.planner is not None or 'oracle_regret' not in told,
+         'the simulator knows what each action costs on the ways there (as a recorded drive does)',
+         'oracle_regret'),
+        (can.depth or 'depth' not in told, 'the simulator has depth pictures', 'none'),
+        (can.labels or not told & {'segmentation', 'goal_segmentation'},
+         'the simulator has labels', 'none'),
+        (can.tilt or not any(action.dpitch for action in robot.actions),
+         'the camera of the simulator is fixed', robot.action_names),
+        (can.other_goals or own_goals or given,
+         'goals_per_room and goal_seed need a simulator that makes goals', (
+             config.goals_per_room, config.goal_seed)),
+        (can.appearance or not varies or given,
+         'light and camera vary in simulators that draw them', 'a randomisation'),
+    )
+    for kept, rule, received in rules:
+        if not kept:
+            raise UserError(rule, received, 'correct the environment configuration, or choose '
+                            'another simulator (vn_nav simulators)')
