@@ -4,6 +4,7 @@ import functools
 import math
 
 import numpy as np
+import pytest
 from conformance import ROBOT, SIZE, Conformance
 
 from vn_nav.robot import RobotSpec
@@ -13,6 +14,7 @@ from vn_sim_bridge.simulators import open_simulator
 from vn_sim_bridge.simulators.recorded import RecordedSimulator
 
 
+@pytest.mark.slow
 class TestHouse(Conformance):
     def make(self, num_envs, size=SIZE):
         return open_simulator(['house:7?rooms=2', 'house:3?rooms=1'],
@@ -40,6 +42,7 @@ def drive_through_a_corridor():
                        world_version='recorded')
 
 
+@pytest.mark.slow
 class TestRecorded(Conformance):
     contact_slack = 0.11  # robots stand on cells of the floor
     depth_slack = 0.7  # that of the picture which was taken nearest

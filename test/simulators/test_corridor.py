@@ -40,6 +40,7 @@ def make(kind=BASE, capabilities=None, **options):
     return NavigationEnv(EnvConfig(scenes=(SCENE,), **options), ROBOT, simulator=simulator)
 
 
+@pytest.mark.slow
 def test_an_environment_opens_it_by_name_and_its_shortest_path_arrives():
     env = NavigationEnv(EnvConfig(scenes=(SCENE, 'examples.corridor:8'), num_envs=8, size=24,
                                   max_decisions=80, privileged=('depth', 'segmentation')))
@@ -235,6 +236,7 @@ def test_a_simulator_that_puts_its_robots_itself():
         make(capabilities=can).reset(seed=0)
 
 
+@pytest.mark.slow
 def test_an_installed_package_adds_a_simulator_by_name(tmp_path):
     facts = tmp_path / 'corridors-0.1.dist-info'
     facts.mkdir()
@@ -275,6 +277,7 @@ def test_what_is_missing_is_one_line_with_the_command(monkeypatch, capsys):
     assert max(map(len, told.splitlines())) <= 80
 
 
+@pytest.mark.slow
 def test_the_table_imports_nothing_before_it_is_asked():
     code = ('import sys; import vn_sim_bridge.simulators as s; s.table(); '
             'print([m for m in sys.modules if m.startswith("vn_sim_bridge.simulators.")])')
