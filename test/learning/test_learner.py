@@ -17,7 +17,8 @@ from vn_nav.learning.presets import PRESETS, TrainConfig, preset
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector
 from vn_nav.observation import Observation
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 
 SMALL = NetworkConfig(actions=TwoBars.action_names, size=36, channels=(8, 8, 8), features=24,
                       hidden=16)

@@ -23,7 +23,8 @@ from vn_nav.learning.learner_config import TEACHERS, LearnerConfig
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.returns import generalised_advantages, masked_mean
 from vn_nav.learning.rollout import Rollout
-from vn_nav.policy.network import IMAGE_HEADS, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import IMAGE_HEADS
 
 Losses = dict[str, float]  # means over the steps of one update
 BASIC_LOSSES = ('policy_loss', 'value_loss', 'entropy', 'kl', 'clipped', 'gradient_norm')

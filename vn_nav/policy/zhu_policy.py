@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import Latents, NetworkConfig, Policy, PolicyOutput
+from vn_nav.policy.network import Latents, Policy, PolicyOutput
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.zhu import SceneLinear, Siamese
 
 
