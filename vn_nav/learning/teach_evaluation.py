@@ -148,7 +148,8 @@ class Evaluation:
         envs: dict[tuple[str, str], Any] = {}
         for count, row in enumerate(chosen.rows):
             def show(share: float, count: int = count, row: Row = row) -> None:
-                if count and stages.left < 0:
+                # A signal is heard also when the minutes are over: below, by `stages`.
+                if count and stages.left < 0 and not stages.interrupted:
                     raise _OutOfTime
                 stages(f'evaluation {count + 1} of {len(chosen.rows)}: '
                        f'{tables.SPLITS[row.split].lower()}, {row.stop}, {row.name}', share)
