@@ -120,13 +120,10 @@ def test_late_and_repeated_pictures_are_left_out():
 
 def test_depth_belongs_to_the_picture_of_its_stamp():
     messages, _ = drive([(0.3, 0.0, 2.0)], rate=10.0)
-
-    def depth(heard):
-        stamp = heard.message.header.stamp
-        return Message('/depth/image_raw', picture(stamp.sec + stamp.nanosec * 1e-9 + 0.004),
-                       heard.time + 0.3)
-
-    depths = [depth(m) for m in messages if m.topic == '/image_raw'][:-1]
+    taken = [(m.message.header.stamp.sec + m.message.header.stamp.nanosec * 1e-9, m.time)
+             for m in messages if m.topic == '/image_raw']
+    depths = [Message('/depth/image_raw', picture(stamp + 0.004), time + 0.3)
+              for stamp, time in taken[:-1]]
     frames, _ = frames_of(sorted(messages + depths, key=lambda heard: heard.time))
     for frame in frames[:-1]:
         stamp = frame.depth.header.stamp

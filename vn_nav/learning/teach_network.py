@@ -41,7 +41,7 @@ def blend(network: Policy, own: float) -> None:
     assert network.routes is not None  # it was made for a place
     for layer, share in ((network.actor, own), (network.routes.advise, ADVISED)):
         for part in layer.parameters():
-            part *= share
+            part.mul_(share)
 
 
 def widened(given: dict[str, torch.Tensor], network: Policy) -> dict[str, torch.Tensor]:

@@ -75,8 +75,9 @@ def teach(job: TeachJob, place: Place) -> Path:
             spot, or of several places.
         KeyboardInterrupt: a signal came; what was learned and measured until then is kept.
     """
-    if not job.resume and (job.out / STATE).is_file():
-        raise UserError('a new run has a folder of its own', str(job.out),
+    bag, out = Path(job.bag), Path(job.out)
+    if not job.resume and (out / STATE).is_file():
+        raise UserError('a new run has a folder of its own', str(out),
                         'go on there with --resume, or choose another folder')
     given = load_checkpoint(job.checkpoint) if job.checkpoint else None
     numbers(job, given, job.minutes, job.minutes)  # refuse before hours what would fail then
@@ -85,8 +86,8 @@ def teach(job: TeachJob, place: Place) -> Path:
         run = None
         try:
             size = given.config.size if given else job.size or SIZE
-            graph = read_place(job.bag, job.options, place.build_graph, robot, size,
-                               Path(job.cache or job.out / 'decoded'), stages,
+            graph = read_place(bag, job.options, place.build_graph, robot, size,
+                               Path(job.cache or out / 'decoded'), stages,
                                stages.at(SEARCHED))
             run = Teaching(job, place, graph, given, robot, stages)
             run.learn()
@@ -129,14 +130,15 @@ class Teaching:
                  given: LoadedCheckpoint | None, robot: RobotSpec, stages: Stages):
         self.job, self.place, self.graph, self.given = job, place, graph, given
         self.robot, self.stages = robot, stages
-        self.folder = job.out / CHECKPOINT
+        self.bag, self.out = Path(job.bag), Path(job.out)
+        self.folder = self.out / CHECKPOINT
         self.own, self.others = place.held_out(graph)
         for line in (*graph.words, 'no goals are held out: there are too few'
                      if self.others is None else
                      f'{len(self.own.goals)} goals to learn, {len(self.others.goals)} held out'):
             print(line, flush=True)
-        job.out.mkdir(parents=True, exist_ok=True)
-        place.draw_map(job.out / 'map.png', self.own, self.others)
+        self.out.mkdir(parents=True, exist_ok=True)
+        place.draw_map(self.out / 'map.png', self.own, self.others)
         self.begun = time.time()  # a checkpoint that is older is of another run
         self.evaluation: Evaluation | None = None
         self.advised = False  # whether any way was learned
@@ -182,14 +184,14 @@ class Teaching:
         env = self._env(self.own, job.envs, seed=job.seed, privileged=config.privileged,
                         **{name: value for name, value in world.items() if name != 'envs'})
         init = job.checkpoint
-        if job.places and not (job.resume and (job.out / STATE).is_file()):
-            init = job.out / START
+        if job.places and not (job.resume and (self.out / STATE).is_file()):
+            init = self.out / START
             self._learn_places(config, FIRST, init)
         left = self.stages.left - RESERVED - self.evaluated
         config = self._config(left, self.learned)
         self.stages('reinforcement', 0.0)
         self.stages.pause()  # a training has a bar of its own
-        train(env, config, job.out, info=self._info(), resume=job.resume, init=init,
+        train(env, config, self.out, info=self._info(), resume=job.resume, init=init,
               pairs=self._pairs)
         self.stages('reinforcement', 1.0)
 
@@ -198,12 +200,12 @@ class Teaching:
         taught = load_checkpoint(self.folder)
         known = self.given.info['stop_threshold'] if self.given else None
         threshold = known or evaluator.STOP_THRESHOLD
-        facts = {'checkpoint': str(self.folder), 'bag': self.job.bag.name,
+        facts = {'checkpoint': str(self.folder), 'bag': self.bag.name,
                  'world_version': taught.info['world_version'], 'task': 'image',
                  'max_decisions': DECISIONS}
         graphs = {name: graph for name, graph in self._graphs().items() if graph is not None}
         self.evaluation = Evaluation(
-            self.job.out, facts, graphs,
+            self.out, facts, graphs,
             lambda graph, envs, stop: self._env(graph, envs, stop=stop), self.robot, threshold)
         try:
             self.evaluation.run(self._plan(self.stages.left - RESERVED), taught.network,
@@ -222,7 +224,7 @@ class Teaching:
             count = sum(len(rows) for split in self.evaluation.result['splits'].values()
                         for rows in split['rows'].values())
             return f'kept: {self.folder}, with {count} of {len(self.rows)} rows'
-        start = self.job.out / START
+        start = self.out / START
         if not self._fresh(self.folder) and self._fresh(start):
             policy = load_checkpoint(start)
             save_checkpoint(self.folder, policy.network, {
@@ -261,7 +263,7 @@ class Teaching:
 
     def _network(self, config: TrainConfig) -> Policy:
         return network_for_place(config, self.robot, self.graph.pictures.shape[-1],
-                                 self.job.seed, self.given and self.given.network)
+                                 self.job.seed, None if self.given is None else self.given.network)
 
     def _learn_places(self, config: TrainConfig, shares: tuple[float, float], folder: Path
                       ) -> None:
@@ -319,6 +321,6 @@ class Teaching:
             'camera_height': self.robot.camera_height,
             'world_version': self.graph.world_version, 'preset': PRESET, 'stop_threshold': None,
             'command': self.job.command,
-            'data': f'{len(self.graph.poses):,} recorded pictures of {self.job.bag.name}{part}',
-            'notes': f'Taught in the pictures of {self.job.bag.name}{part}: '
+            'data': f'{len(self.graph.poses):,} recorded pictures of {self.bag.name}{part}',
+            'notes': f'Taught in the pictures of {self.bag.name}{part}: '
                      f'{"; ".join(self.graph.words)}.'}

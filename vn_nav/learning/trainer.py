@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from vn_nav.errors import EnvironmentLost
 from vn_nav.learning.bag_mix import BagMix
@@ -94,7 +95,8 @@ class _Signals:
     """An event that SIGINT and SIGTERM set while the context lasts (in the main thread)."""
 
     def __enter__(self) -> threading.Event:
-        self.event, self.before = threading.Event(), {}
+        self.event = threading.Event()
+        self.before: dict[int, Callable[..., Any] | int | None] = {}
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self.before[number] = signal.signal(number, self._hear)
