@@ -174,8 +174,9 @@ class Evaluation:
     def _actor(self, env, row: Row, network: Policy, before: Policy | None
                ) -> tuple[evaluator.Actor, str]:
         controls = (row.name,) if row.name in evaluator.CONTROLS else ()
-        actors = evaluator.make_actors(env, before if row.name == BEFORE else network, DECODING,
-                                       controls, self.threshold, SEED)
+        drives = before if row.name == BEFORE else network
+        assert drives is not None  # `rows_of` lists no row without its policy
+        actors = evaluator.make_actors(env, drives, DECODING, controls, self.threshold, SEED)
         return actors[RIGHT if row.name == BEFORE else row.name]
 
     def _keep(self, row: Row, episodes: list) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.encoders import Fused, Matching, OneStream, TwoStreams
+from vn_nav.policy.encoders import Encoder, Fused, Matching, OneStream, TwoStreams
 from vn_nav.policy.heads import (
     GoalPose,
     ImageHead,
@@ -32,6 +32,7 @@ from vn_nav.policy.memory import (
 )
 from vn_nav.policy.network_config import IMAGE_HEADS, NetworkConfig
 from vn_nav.policy.places import WIDTH, MultiViewAveraging, PlaceClassifier, Routes
+from vn_nav.policy.zhu import SceneLinear, Siamese
 
 # Pictures go through the encoder in parts of this size on a processor: larger float32 pixels are
 # mapped and unmapped by the allocator at every call, which costs a tenth of the whole training.
@@ -72,6 +73,14 @@ class Policy(nn.Module):
     """
 
     frozen = False
+    encoder: Encoder | Siamese
+    memory: Feedforward | MaskedLSTM | SceneLinear
+    actor: nn.Linear | SceneLinear
+    critic: nn.Linear | SceneLinear
+    tracker: GoalTracker | None
+    places: PlaceClassifier | None
+    routes: Routes | None
+    around: MultiViewAveraging | None
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -84,20 +93,22 @@ class Policy(nn.Module):
         if config.architecture == 'icra2017':
             raise UserError('a policy of icra2017 is made by zhu_policy.build_policy',
                             config.architecture, 'call that')
-        pixels = {'mean': config.pixel_mean, 'std': config.pixel_std, 'frames': config.frames}
-        own = {'fused': Fused, 'matching': Matching}.get(config.architecture)
-        if own is not None:
-            self.encoder = own(config.size, config.channels, config.features, config.blocks,
-                               **pixels)
+        pixels = config.pixel_mean, config.pixel_std, config.frames
+        thesis = config.architecture in ('thesis', 'unreal')
+        encoder: Encoder
+        if thesis:
+            published: type[TwoStreams | OneStream] = (
+                TwoStreams if config.architecture == 'thesis' else OneStream)
+            encoder = published(config.size, *pixels)
         else:
-            encoder = {'thesis': TwoStreams, 'unreal': OneStream}[config.architecture]
-            self.encoder = encoder(config.size, **pixels)
-        inputs = (self.encoder.features + len(config.actions) + 1
+            own: type[Fused | Matching] = Fused if config.architecture == 'fused' else Matching
+            encoder = own(config.size, config.channels, config.features, config.blocks, *pixels)
+        self.encoder = encoder
+        inputs = (encoder.features + len(config.actions) + 1
                   + (5 if config.pose_to_memory else 0)
                   + (GoalTracker.WIDTH if config.moves else 0)
                   + (WIDTH if config.places else 0))
         self.tracker = GoalTracker(config.moves) if config.moves else None
-        thesis = own is None
         if config.frames > 1:
             self.memory = Feedforward(inputs, config.hidden)
         else:
@@ -110,26 +121,18 @@ class Policy(nn.Module):
                                           config.pixel_std)
             self.routes = Routes(self.places.width, len(config.actions))
             with torch.no_grad():
-                self._goal_shape = self.encoder.encode_goals(
+                self._goal_shape = encoder.encode_goals(
                     torch.zeros(1, 3, config.size, config.size, dtype=torch.uint8),
                     torch.float32).shape[1:]
-        self.actor = nn.Linear(config.hidden, len(config.actions))
-        self.critic = nn.Linear(config.hidden, 1)
-        self._initialise(thesis)
-        channels, side = self.encoder.maps
+        self.actor = actor = nn.Linear(config.hidden, len(config.actions))
+        self.critic = critic = nn.Linear(config.hidden, 1)
+        for layer, gain in ((actor, 0.01), (critic, 1.0)):
+            _initialise(layer, gain, thesis)
+        channels, side = encoder.maps
         self.target_side = grown(side, config.deconvolutions)
         self.cell = max(config.size // self.target_side, 1)
         self.heads = nn.ModuleDict({name: self._head(name, channels, side)
                                     for name in config.heads})
-
-    def _initialise(self, thesis: bool) -> None:
-        for layer, gain in ((self.actor, 0.01), (self.critic, 1.0)):
-            if thesis:
-                bound = layer.in_features**-0.5
-                nn.init.uniform_(layer.weight, -bound, bound)
-            else:
-                nn.init.orthogonal_(layer.weight, gain)
-            nn.init.zeros_(layer.bias)
 
     def _head(self, name: str, channels: int, side: int) -> nn.Module:
         config = self.config
@@ -239,12 +242,14 @@ class Policy(nn.Module):
             hidden, tracked, looked = state.hidden.split((self.config.hidden, *self._beside), 1)
             own = RecurrentState(hidden, state.cell)
         if self.tracker is not None:
+            assert pose is not None  # moves are given with pose_to_memory alone
             seen, tracked = self.tracker(
                 *(part.detach().view(steps, batch, *part.shape[1:]) for part in pose),
                 obs.last_action, starts, tracked)
             inputs.append(seen.to(dtype))
             beside.append(tracked)
         if self.places is not None:
+            assert self.routes is not None and goal_places is not None  # made with the places
             if obs.goal_index is not None:
                 goal_places = goal_places[obs.goal_index.flatten()]
             here = self.places(obs.image.flatten(0, 1), self.compute_dtype)
@@ -322,6 +327,15 @@ class Policy(nn.Module):
         return self.read(latents), state
 
 
+def _initialise(layer: nn.Linear, gain: float, thesis: bool) -> None:
+    if thesis:
+        bound = layer.in_features**-0.5
+        nn.init.uniform_(layer.weight, -bound, bound)
+    else:
+        nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+
+
 def _compass(pose: Pose) -> Tensor:
     """What the memory sees of a pose, [N,5]: vague where the pictures share nothing.
 
@@ -344,7 +358,7 @@ class GoalMaps:
 
     def of(self, goals: Tensor, goal_index: Tensor) -> Tensor:
         """[N,...] for the goals `goals`[goal_index]; the network then takes None as the index."""
-        if self._index is None:
+        if self._index is None or self._maps is None:  # nothing is kept yet
             self._maps = self.network.encode_goals(goals[goal_index])
         else:
             changed = torch.nonzero(goal_index != self._index).squeeze(1)
