@@ -23,7 +23,8 @@ from common import pin
 
 from vn_nav.cli.world import machine
 from vn_nav.learning.pairs import PairConfig, look, pretrain_pairs
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.datasets.house_pairs import PairSampler
 from vn_sim_bridge.houses.splits import SPLITS

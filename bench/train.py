@@ -47,7 +47,8 @@ from peers_train import (
 from vn_nav.learning.learner import Learner
 from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.rollout import Collector
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 
 ROUNDS = 7
 SAMPLE = 8  # environments whose rollout the networks are compared on

@@ -12,7 +12,8 @@ import torch
 
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.checkpoint import save_checkpoint
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.simulators.house import WORLD_VERSION
 

@@ -90,7 +90,7 @@ def test_plug_ins_of_an_installed_ros_stay_outside(tmp_path):
     words = [sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', '--collect-only', '-q']
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith('PYTEST_')} | {'PYTHONPATH': str(tmp_path)}
-    here = subprocess.run([*words, str(CONFTEST.with_name('test_robots.py'))], text=True,
+    here = subprocess.run([*words, str(CONFTEST.parent / 'nodes' / 'test_robots.py')], text=True,
                           cwd=CONFTEST.parent.parent, capture_output=True, timeout=60,
                           env=environment)
     assert here.returncode == 0, here.stdout + here.stderr

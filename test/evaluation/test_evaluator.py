@@ -16,7 +16,8 @@ from vn_nav.evaluation.evaluator import (
     split_figures,
 )
 from vn_nav.evaluation.metrics import Episode
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.report import tables
 from vn_nav.report.evaluation_page import choose, evaluation_page, outcome
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec

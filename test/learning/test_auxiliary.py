@@ -12,7 +12,8 @@ from vn_nav.errors import UserError
 from vn_nav.learning import auxiliary
 from vn_nav.learning.auxiliary import image_target
 from vn_nav.learning.pixel_change import label_colours, pixel_change
-from vn_nav.policy.network import HEADS, NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import HEADS, NetworkConfig
 
 GREY = (0.299, 0.587, 0.114)
 

@@ -26,7 +26,8 @@ from vn_nav.learning.trainer import train
 from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 
 FACTS = {'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0}
 TASKS = {'goal_pose': 0.5, 'arrival': 0.2, 'distance': 0.1, 'imitation': 1.0, 'depth': 0.1}

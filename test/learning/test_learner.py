@@ -17,7 +17,9 @@ from vn_nav.learning.presets import PRESETS, TrainConfig, preset
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector
 from vn_nav.observation import Observation
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.zhu_policy import build_policy
 
 SMALL = NetworkConfig(actions=TwoBars.action_names, size=36, channels=(8, 8, 8), features=24,
                       hidden=16)
@@ -34,7 +36,7 @@ def generator(seed=0):
 
 
 def network_of(config, size=36):
-    return Policy(config.network(TwoBars.action_names, size))
+    return build_policy(config.network(TwoBars.action_names, size))
 
 
 def memory_of(config, envs=6, size=36):

@@ -19,7 +19,8 @@ from vn_nav.learning.state_file import read_state
 from vn_nav.learning.supervised import Batch, Guess, Objective, Tally
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.heads import Pose
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.report.compare import compare
 

@@ -26,7 +26,8 @@ from vn_nav.learning.replay import Replay
 from vn_nav.learning.state_file import read_state, remove_partial
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
 

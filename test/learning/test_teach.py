@@ -325,7 +325,7 @@ def test_after_sigint_there_is_a_whole_checkpoint_and_the_rows_so_far(sign, kept
         process = subprocess.Popen(
             [sys.executable, '-m', 'vn_nav.cli', 'teach', str(bag), '--out', str(out),
              '--checkpoint', 'models/anywhere', '--goals', '8', '--cache', str(tmp_path / 'cache'),
-             '--minutes', '10' if sign == 'learning the place' else '1.2'], stdout=said,
+             '--minutes', '10' if sign == 'learning the place' else '2'], stdout=said,
             stderr=subprocess.STDOUT)
     try:
         until = time.monotonic() + 240
@@ -380,7 +380,7 @@ def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, caps
     bag, out = write_bag(tmp_path / 'bag', *driven), tmp_path / 'out'
     given = load_checkpoint('models/anywhere')
     assert main(['teach', str(bag), '--out', str(out), '--checkpoint', 'models/anywhere',
-                 '--minutes', '0.8', '--goals', '8', '--episodes', '1']) == 0
+                 '--minutes', '1.2', '--goals', '8', '--episodes', '1']) == 0
     said = capsys.readouterr().out
     assert 'the advised action loses' in said and 'on others' in said
     taught = load_checkpoint(out / 'checkpoint')

@@ -21,7 +21,8 @@ from vn_nav.policy.action_filter import RESTLESS_RAD as RESTLESS
 from vn_nav.policy.action_filter import SEEN_RAD as SEEN
 from vn_nav.policy.action_filter import BlockedActionFilter, FilterCounts
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime, choose, choose_filtered
 
 TURN = math.radians(30)

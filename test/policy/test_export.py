@@ -13,7 +13,7 @@ from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import LoadedCheckpoint, save_checkpoint
 from vn_nav.policy.checkpoint_info import INFO
 from vn_nav.policy.export import OPSET, export_onnx
-from vn_nav.policy.network import NetworkConfig
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec

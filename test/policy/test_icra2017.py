@@ -17,7 +17,7 @@ from vn_nav.learning.rollout import Collector
 from vn_nav.observation import Observation
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import NetworkConfig
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.resnet import ResNet50, load_frozen_weights
 from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.zhu import RandomFeatures, scene_numbers

@@ -11,7 +11,8 @@ from vn_nav.errors import UserError
 from vn_nav.learning.presets import preset
 from vn_nav.observation import Observation
 from vn_nav.policy.memory import RecurrentState, stack_frames
-from vn_nav.policy.network import ARCHITECTURES, HEADS, NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import ARCHITECTURES, HEADS, NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS
 
 SMALL = NetworkConfig(actions=DRIVE_ACTIONS, size=36, channels=(8, 8, 8), features=24, hidden=16)

@@ -16,7 +16,8 @@ from vn_nav.learning.auxiliary import imitation_loss
 from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spots
 from vn_nav.learning.teach_network import widened
 from vn_nav.observation import Observation
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.places import HEADINGS, MultiViewAveraging
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.datasets.recorded_views import GraphViews

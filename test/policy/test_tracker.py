@@ -11,7 +11,8 @@ from vn_nav.co_visibility import relative_pose
 from vn_nav.errors import UserError
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.memory import GoalTracker
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 ROBOT = RobotSpec().with_actions((*DRIVE_ACTIONS, 'left'))

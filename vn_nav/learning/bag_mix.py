@@ -15,7 +15,8 @@ from vn_nav.learning.presets import TrainConfig
 from vn_nav.learning.pretraining import PretrainConfig, choose_parts
 from vn_nav.learning.rollout import Rollout
 from vn_nav.learning.supervised import NEEDS, Batch, Objective, Tally
-from vn_nav.policy.network import IMAGE_HEADS, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import IMAGE_HEADS
 
 WINDOW, FARTHEST = PretrainConfig().window, PretrainConfig().farthest  # steps, as there
 PAIRS, WINDOWS = 0, 1  # streams of random numbers

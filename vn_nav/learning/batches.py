@@ -24,17 +24,21 @@ def select(rollout: Rollout, columns: Tensor, few_goals: bool = True) -> Rollout
     if few_goals:
         observation = few_goals_of(observation)
 
-    def part(rows: Tensor | None) -> Tensor | None:
-        return None if rows is None else rows[:, columns]
+    def part(rows: Tensor) -> Tensor:
+        return rows[:, columns]
+
+    def if_known(rows: Tensor | None) -> Tensor | None:
+        return None if rows is None else part(rows)
     return Rollout(
-        observation, *(part(getattr(rollout, name)) for name in (
-            'starts', 'action', 'reward', 'terminated', 'truncated', 'valid')),
+        observation, starts=part(rollout.starts), action=part(rollout.action),
+        reward=part(rollout.reward), terminated=part(rollout.terminated),
+        truncated=part(rollout.truncated), valid=part(rollout.valid),
         state=(None if rollout.state is None
                else RecurrentState(*(rows[columns] for rows in rollout.state))),
         privileged={key: part(rows) for key, rows in rollout.privileged.items()},
-        driven=part(rollout.driven),
-        log_probability=part(rollout.log_probability), value=part(rollout.value),
-        filter_offsets=part(rollout.filter_offsets))
+        driven=if_known(rollout.driven),
+        log_probability=if_known(rollout.log_probability), value=if_known(rollout.value),
+        filter_offsets=if_known(rollout.filter_offsets))
 
 
 def few_goals_of(observation: Observation) -> Observation:
@@ -52,5 +56,6 @@ def acting_rows(observation: Observation) -> Observation:
     """All rows but the last, which only bootstraps."""
     extras = observation.extras
     return Observation(observation.image[:-1], observation.goals,
-                       *(rows[:-1] for rows in observation[2:5]),
+                       observation.goal_index[:-1], observation.last_action[:-1],
+                       observation.last_reward[:-1],
                        extras and {key: rows[:-1] for key, rows in extras.items()})

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from vn_nav.errors import UserError
 from vn_nav.learning import auxiliary
@@ -23,7 +23,8 @@ from vn_nav.learning.learner_config import TEACHERS, LearnerConfig
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.returns import generalised_advantages, masked_mean
 from vn_nav.learning.rollout import Rollout
-from vn_nav.policy.network import IMAGE_HEADS, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import IMAGE_HEADS
 
 Losses = dict[str, float]  # means over the steps of one update
 BASIC_LOSSES = ('policy_loss', 'value_loss', 'entropy', 'kl', 'clipped', 'gradient_norm')
@@ -47,7 +48,7 @@ class Learner:
 
     def __init__(self, network: Policy, config: LearnerConfig, generator: torch.Generator, *,
                  replay: Replay | None = None,
-                 average_gradients: Callable[[list[Tensor]], None] | None = None,
+                 average_gradients: Callable[[list[nn.Parameter]], None] | None = None,
                  processes: Processes | None = None,
                  beside: Callable[[Rollout], Tensor] | None = None):
         missing = [name for name in config.heads if name not in network.heads]
@@ -67,6 +68,7 @@ class Learner:
             network, self._loss, unused=set(network.heads) != set(config.heads))
         self.failed_batch: Path | None = None  # where to leave a batch whose loss is not finite
         parameters = [part for part in network.parameters() if part.requires_grad]
+        self.optimiser: torch.optim.Optimizer
         if config.optimiser == 'adam':
             self.optimiser = torch.optim.Adam(parameters, config.learning_rate, eps=1e-5,
                                               fused=True)
@@ -103,6 +105,7 @@ class Learner:
         terminated, truncated = rollout.terminated, rollout.truncated
         if config.truncation_is_terminal:
             terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
+        assert rollout.value is not None  # the network collected it
         advantage = generalised_advantages(rollout.reward, rollout.value, terminated, truncated,
                                            gamma=config.gamma, lam=config.lam)
         target = advantage + rollout.value[:-1]
@@ -130,7 +133,7 @@ class Learner:
     def _step(self, batch: Rollout, advantage: Tensor, target: Tensor,
               entropy_coefficient: float) -> Tensor:
         """One step of the optimiser: one loss, one backward pass, one clipping of the norm."""
-        self._drawn: dict[str, object] = {}
+        self._drawn: dict[str, Rollout | dict] = {}
         with self.processes.counted_together():
             loss, figures = self.objective(batch, advantage, target, entropy_coefficient)
         self.optimiser.zero_grad(set_to_none=True)
@@ -157,6 +160,7 @@ class Learner:
             logits = logits + batch.filter_offsets
         log_all = torch.log_softmax(logits, dim=-1)
         log_new = log_all.gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
+        assert batch.log_probability is not None  # the network collected it
         log_ratio = log_new - batch.log_probability
         ratio = log_ratio.exp()
         gain = ratio * advantage
@@ -206,6 +210,7 @@ class Learner:
         names = [name for name in config.from_replay if name in IMAGE_HEADS]
         if not names:
             return {}
+        assert self.replay is not None  # `from_replay` is refused without
         window = self.replay.windows(config.replay_batch, config.replay_length, self.generator)
         self._drawn |= dict.fromkeys(names, window)
         maps = network.maps(acting_rows(window.observation), window.starts[:-1])
@@ -214,6 +219,7 @@ class Learner:
     def _replayed_loss(self, name: str) -> Tensor:
         """Loss of a task on a draw of its own from the replay memory."""
         config, network = self.config, self.network
+        assert self.replay is not None  # `from_replay` is refused without
         if name == 'reward_prediction':
             seen, label = self.replay.reward_frames(config.replay_batch, self.generator,
                                                     unrewarded=config.unrewarded)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from vn_nav.errors import UserError
-from vn_nav.policy.network import IMAGE_HEADS
+from vn_nav.policy.network_config import IMAGE_HEADS
 
 # Tasks whose weight is a field of `LearnerConfig`. The first three learn from the replay memory.
 REPLAY_TASKS = ('pixel_control', 'value_replay', 'reward_prediction')

@@ -23,7 +23,8 @@ from vn_nav.learning.auxiliary import POSE_OVERLAP, image_target, pose_loss
 from vn_nav.learning.state_file import read_state, write_state
 from vn_nav.policy.encoders import Fused, Matching
 from vn_nav.policy.heads import Pose
-from vn_nav.policy.network import IMAGE_HEADS, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import IMAGE_HEADS
 
 STATE, METRICS = 'pairs_state', 'pairs.csv'
 COLUMNS = ('pairs', 'minutes', 'loss', 'bearing_deg', 'bearing_within_30', 'heading_deg',

@@ -26,7 +26,7 @@ from vn_nav.errors import UserError
 from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.encoders import LARGE
-from vn_nav.policy.network import NetworkConfig
+from vn_nav.policy.network_config import NetworkConfig
 
 
 def _is_finite(value) -> bool:

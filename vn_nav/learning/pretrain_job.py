@@ -24,7 +24,8 @@ from vn_nav.learning.presets import TrainConfig, preset
 from vn_nav.learning.pretraining import PretrainConfig, choose_parts, pretrain_network
 from vn_nav.learning.supervised import PARTS
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 RANDOM_POSES = 'random'  # the entry `poses` of the topic scene in bags of `vn_nav collect`

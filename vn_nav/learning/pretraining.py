@@ -34,7 +34,8 @@ from vn_nav.learning.supervised import (
     Tally,
 )
 from vn_nav.policy.checkpoint import save_checkpoint
-from vn_nav.policy.network import IMAGE_HEADS, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import IMAGE_HEADS
 
 STATE, CHECKPOINT = 'pretrain_state', 'checkpoint'
 # frames, minutes, tau and success are what `vn_nav compare` asks for; no episode is driven here.

@@ -21,7 +21,8 @@ from vn_nav.observation import Observation
 from vn_nav.policy.action_filter import make_filter
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
-from vn_nav.policy.zhu import Siamese, check_scenes
+from vn_nav.policy.zhu import check_scenes
+from vn_nav.policy.zhu_policy import ScenePolicy
 from vn_nav.vector_env import NavigationVectorEnv
 
 
@@ -36,7 +37,7 @@ class Rollout:
     terminated: Tensor  # [T,B] bool
     truncated: Tensor  # [T,B] bool
     valid: Tensor  # [T,B] bool: False on reset rows, which are no frames
-    state: RecurrentState  # before the first row
+    state: RecurrentState | None  # before the first row; None: empty
     # [T+1,B,...] What a simulator knows and the network must not see: targets of losses.
     privileged: dict[str, Tensor] = dataclasses.field(default_factory=dict)
     driven: Tensor | None = None  # [T,B] bool: a teacher chose the action, not the policy
@@ -55,14 +56,15 @@ class Rollout:
         """Everything but the goal pictures, as plain tensors on the host."""
         rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         rows['observation'] = self.observation._replace(goals=None)._asdict()
-        rows['state'] = list(self.state)
+        rows['state'] = None if self.state is None else list(self.state)
         return _on_host(rows)
 
     @staticmethod
     def from_state(state: dict, goals: Tensor) -> Rollout:
         """The rollout of a `state_dict`; `goals` [G,3,S,S] are its environment's."""
+        memory = state['state']
         return Rollout(**{**state, 'observation': Observation(**state['observation'] | {
-            'goals': goals}), 'state': RecurrentState(*state['state'])})
+            'goals': goals}), 'state': None if memory is None else RecurrentState(*memory)})
 
 
 class Episode(NamedTuple):
@@ -98,7 +100,7 @@ class Collector:
         self.on_device = isinstance(env.goals, Tensor)
         self.told: dict[str, Tensor] = {}  # beside the present observation
         self.goals = self._tensor(env.goals)
-        if network.frozen:
+        if isinstance(network, ScenePolicy):
             self.goals = network.look(self.goals)
         self._scenes = network.config.scenes
         n = env.num_envs
@@ -220,10 +222,9 @@ class Collector:
 
     def _empty_extras(self, steps: int) -> dict[str, Tensor] | None:
         """Room for what only the architecture icra2017 looks at."""
-        if not self.network.frozen:
+        if not isinstance(self.network, ScenePolicy):
             return None
         encoder, n = self.network.encoder, self.env.num_envs
-        assert isinstance(encoder, Siamese)  # which is frozen
         extras = {'features': torch.empty(steps, n, encoder.frozen.features, device=self.device)}
         if self._scenes > 1:
             extras['scene'] = torch.empty(steps, n, dtype=torch.int64, device=self.device)
@@ -232,6 +233,7 @@ class Collector:
     def _fill_extras(self, seen: Observation, t: int) -> None:
         if seen.extras is None:
             return
+        assert isinstance(self.network, ScenePolicy)  # no other has room for them
         # Never encoded again: not by the learner either.
         seen.extras['features'][t] = self.network.look(seen.image[t])
         if self._scenes > 1:

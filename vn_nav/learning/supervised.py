@@ -18,7 +18,8 @@ from vn_nav.learning.pixel_change import average_pool_target
 from vn_nav.learning.returns import masked_mean
 from vn_nav.observation import Observation
 from vn_nav.policy.heads import Pose
-from vn_nav.policy.network import IMAGE_HEADS, Latents, Policy
+from vn_nav.policy.network import Latents, Policy
+from vn_nav.policy.network_config import IMAGE_HEADS
 
 # What an image head needs beside the picture: an array of `DriveSet`.
 NEEDS = {'depth': 'depth', 'segmentation': 'labels', 'goal_segmentation': 'labels'}

@@ -16,8 +16,9 @@ from vn_nav.robot import RobotSpec
 class Place(Protocol):
     """What the simulator's half makes of a drive; `vn_sim_bridge.teach_place` is one."""
 
-    def build_graph(self, pictures, poses, episode, robot: RobotSpec, **options) -> Any:
-        """A place out of pictures with poses."""
+    @property
+    def build_graph(self) -> Callable[..., Any]:
+        """Makes a place out of pictures with poses; what `read_place` calls."""
 
     def held_out(self, graph) -> tuple[Any, Any]:
         """The place with the goals to learn, and with those to judge by, or None."""

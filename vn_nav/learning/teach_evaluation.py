@@ -148,7 +148,8 @@ class Evaluation:
         envs: dict[tuple[str, str], Any] = {}
         for count, row in enumerate(chosen.rows):
             def show(share: float, count: int = count, row: Row = row) -> None:
-                if count and stages.left < 0:
+                # A signal is heard also when the minutes are over: below, by `stages`.
+                if count and stages.left < 0 and not stages.interrupted:
                     raise _OutOfTime
                 stages(f'evaluation {count + 1} of {len(chosen.rows)}: '
                        f'{tables.SPLITS[row.split].lower()}, {row.stop}, {row.name}', share)
@@ -173,8 +174,9 @@ class Evaluation:
     def _actor(self, env, row: Row, network: Policy, before: Policy | None
                ) -> tuple[evaluator.Actor, str]:
         controls = (row.name,) if row.name in evaluator.CONTROLS else ()
-        actors = evaluator.make_actors(env, before if row.name == BEFORE else network, DECODING,
-                                       controls, self.threshold, SEED)
+        drives = before if row.name == BEFORE else network
+        assert drives is not None  # `rows_of` lists no row without its policy
+        actors = evaluator.make_actors(env, drives, DECODING, controls, self.threshold, SEED)
         return actors[RIGHT if row.name == BEFORE else row.name]
 
     def _keep(self, row: Row, episodes: list) -> None:

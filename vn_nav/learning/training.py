@@ -31,7 +31,7 @@ from vn_nav.learning.state_file import read_state, remove_partial, write_state, 
 from vn_nav.learning.training_state import initial_weights, restore, state_of
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.resnet import load_frozen_weights
-from vn_nav.policy.zhu_policy import build_policy
+from vn_nav.policy.zhu_policy import ScenePolicy, build_policy
 from vn_nav.vector_env import NavigationVectorEnv
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
@@ -60,6 +60,7 @@ class Training:
             self.network = build_policy(config.network(
                 tuple(env.action_names), size, env.robot.moves if config.track_goal else ()))
         if config.frozen_weights:
+            assert isinstance(self.network, ScenePolicy)  # no other has a frozen encoder
             load_frozen_weights(self.network.encoder.frozen, config.frozen_weights)
         self.network.to(config.device)
         self.network.compute_dtype = (

@@ -17,6 +17,8 @@ from vn_nav.nodes.qos import qos
 from vn_nav.policy.clock_watch import ClockWatch
 from vn_nav.policy.navigator import Navigator
 
+TOPIC = 'cmd_vel'
+PATIENCE = 0.5  # s without odometry after which lock-step sends a command unasked
 CROSSING = 0.03  # s of wall time, see _lock_step
 # Odometry that moves by this, and by more than the robot could have, was set anew.
 JUMP_M, JUMP_RAD = 0.1, 0.3
@@ -44,8 +46,8 @@ class CommandOutput:
     """
 
     def __init__(self, node, navigator: Navigator, wake: threading.Condition, *, period: float,
-                 lock_step: bool, stamped: bool, name: str = 'cmd_vel',
-                 patience: float | None = 0.5):
+                 lock_step: bool, stamped: bool, name: str = TOPIC,
+                 patience: float | None = PATIENCE):
         self._node, self._navigator, self._wake = node, navigator, wake
         self._period, self._in_lock_step = period, lock_step
         self._is_running: Callable[[], bool] = lambda: False

@@ -23,7 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.errors import UserError
 from vn_nav.nodes import policy_parameters
-from vn_nav.nodes.command_output import CommandOutput
+from vn_nav.nodes.command_output import PATIENCE, TOPIC, CommandOutput
 from vn_nav.nodes.decision_worker import DecisionWorker
 from vn_nav.nodes.diagnosis import Diagnosis
 from vn_nav.nodes.policy_inputs import PolicyInputs
@@ -44,13 +44,14 @@ WORKER_PATIENCE = 5.0  # s that a decision under way is waited for when the node
 class PolicyNode(LifecycleNode):
     """See the module's docstring; what it does in which state is `vn_nav.policy.navigator`."""
 
+    navigator: Navigator  # from on_configure on, as the interfaces are
+
     def __init__(self):
         super().__init__('policy_node')
         policy_parameters.declare(self)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._wake = threading.Condition()  # guards everything below, and wakes both threads
-        self.navigator: Navigator | None = None
         self._threads: WorkThreads | None = None  # of the newest activation
         self._interfaces: list = []
         self.broken = ''  # why the node went inactive by itself
@@ -116,7 +117,7 @@ class PolicyNode(LifecycleNode):
             self, self.navigator, self._wake, period=1.0 / value['control_rate'],
             lock_step=self.lock_step, stamped=value['enable_stamped_cmd_vel'],
             # In a shadow nothing waits for commands: each answers odometry or a decision.
-            **({'name': 'shadow/cmd_vel', 'patience': None} if shadow else {}))
+            name=f'shadow/{TOPIC}' if shadow else TOPIC, patience=None if shadow else PATIENCE)
         self._worker = DecisionWorker(self, self.navigator, runtime, self._wake,
                                       lock_step=self.lock_step, shadow=shadow)
         self._require_odometry = value['require_odometry']
@@ -222,14 +223,15 @@ class PolicyNode(LifecycleNode):
             True; False when the decision under way did not end within `WORKER_PATIENCE`.
         """
         with self._wake:
-            if not self.is_running:
+            threads = self._threads
+            if threads is None or not threads.is_running():
                 return True
             self.navigator.stop(reason, time.monotonic())
-            self._threads.end()
+            threads.end()
             self._wake.notify_all()
-        self._threads.join('output')  # it waits for nothing but `wake`
+        threads.join('output')  # it waits for nothing but `wake`
         self._output.deliver_zero()  # the output thread is gone: still only one owner
-        ended = self._threads.join('inference', WORKER_PATIENCE)
+        ended = threads.join('inference', WORKER_PATIENCE)
         if not ended:
             self.get_logger().error(f'a decision did not end within {WORKER_PATIENCE:g} s')
         return ended
@@ -325,7 +327,7 @@ class PolicyNode(LifecycleNode):
 
     def _diagnose(self) -> None:
         """Publish the state once a second, and at once when it changes."""
-        if self.navigator is None or not self._interfaces:
+        if not self._interfaces:
             return
         if time.monotonic() - self._warned_at > WARNINGS_PERIOD:
             self._warned_at = time.monotonic()

@@ -33,7 +33,8 @@ from vn_nav.policy.checkpoint_info import (
     config_checksum,
     read_config,
 )
-from vn_nav.policy.network import NetworkConfig, Policy
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.zhu_policy import build_policy
 
 HEADER_BYTES = 1_000_000  # of a safetensors file, beside its weights

@@ -324,3 +324,6 @@ class OneStream(nn.Module):
         """Maps [N,32,9,9] and features [N,256]."""
         x = F.relu(apply(self.conv2, F.relu(self.first(image, dtype))))
         return x, F.relu(apply(self.trunk, x.flatten(1)))
+
+
+Encoder = Fused | Matching | TwoStreams | OneStream  # that learn with the policy

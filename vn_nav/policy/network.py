@@ -6,7 +6,6 @@ of the square pictures [pixels], F features.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import torch
@@ -14,8 +13,7 @@ from torch import Tensor, nn
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
-from vn_nav.policy.encoders import Fused, Matching, OneStream, TwoStreams
+from vn_nav.policy.encoders import Encoder, Fused, Matching, OneStream, TwoStreams
 from vn_nav.policy.heads import (
     GoalPose,
     ImageHead,
@@ -32,112 +30,13 @@ from vn_nav.policy.memory import (
     RecurrentState,
     stack_frames,
 )
+from vn_nav.policy.network_config import IMAGE_HEADS, NetworkConfig
 from vn_nav.policy.places import WIDTH, MultiViewAveraging, PlaceClassifier, Routes
-from vn_nav.policy.zhu import FROZEN
+from vn_nav.policy.zhu import SceneLinear, Siamese
 
-ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
-# Channels that each image head draws, and the width of its inner maps. The thesis says that depth
-# has "only" 32, so the segmentation heads are wider.
-IMAGE_HEADS = {'depth': (1, 32), 'segmentation': (3, 64), 'goal_segmentation': (3, 64),
-               'reconstruction': (3, 32)}
 # Pictures go through the encoder in parts of this size on a processor: larger float32 pixels are
 # mapped and unmapped by the allocator at every call, which costs a tenth of the whole training.
 CHUNK_BYTES = 2**24
-HEADS = ('pixel_control', 'reward_prediction', *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance')
-
-
-@dataclasses.dataclass(frozen=True)
-class NetworkConfig:
-    """Everything that fixes the network's shape; stored in the checkpoint."""
-
-    actions: tuple[str, ...]
-    size: int = 84  # pixels a side
-    architecture: str = 'fused'  # of ARCHITECTURES, see `vn_nav.policy.encoders` and `zhu`
-    channels: tuple[int, int, int] = (32, 64, 32)  # of the fused encoder
-    blocks: int = 0  # residual blocks a stage of the fused encoder
-    features: int = 256  # of the fused encoder's trunk
-    hidden: int = 256  # of the LSTM
-    frames: int = 1  # more: pictures stacked as channels, and no LSTM
-    heads: tuple[str, ...] = ()  # of HEADS
-    deconvolutions: int = 1  # of pixel control and image heads: 84 px give 20 x 20, or 42 x 42
-    pose_to_memory: bool = False  # the memory also sees what the head goal_pose says
-    # [A,3] dx, dy [m], dyaw [rad] of the actions: with them the memory also sees where the goal
-    # stands by dead reckoning since it was seen, see `GoalTracker`. Empty: it does not.
-    moves: tuple[tuple[float, float, float], ...] = ()
-    # Place cells of the one place that the policy recognises; more than none: the memory also sees
-    # where there picture and goal were taken, see `vn_nav.policy.places`.
-    places: int = 0
-    # Of `vn_nav.policy.action_filter.FILTERS`: what whoever chooses actions by the logits puts in
-    # between, no part of the network. '': blocked actions where there are moves, as it was before
-    # checkpoints said so; else none.
-    action_filter: str = ''
-    # Grey levels. Standardised input is what made learning work; whole numbers up to 256 less a
-    # whole mean stay exact in bfloat16.
-    pixel_mean: float = 120.0
-    pixel_std: float = 36.0
-    # Of icra2017 alone.
-    frozen: str = ''  # encoder, of `vn_nav.policy.zhu.FROZEN`
-    scenes: int = 1  # that have layers of their own
-
-    def __post_init__(self):
-        for name in ('actions', 'channels', 'heads'):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
-        object.__setattr__(self, 'moves', tuple(map(tuple, self.moves)))
-        if self.action_filter == self._usual_filter:  # said or not, it is the same
-            object.__setattr__(self, 'action_filter', '')
-        rules = (
-            (len(self.actions) >= 2 and len(set(self.actions)) == len(self.actions),
-             'a policy has at least two actions with distinct names', self.actions),
-            (isinstance(self.size, int) and 36 <= self.size <= 1024,
-             'the network takes pictures of 36 to 1024 pixels a side', self.size),
-            (self.architecture in ARCHITECTURES,
-             f'the architecture is one of {", ".join(ARCHITECTURES)}', self.architecture),
-            (len(self.channels) == 3 and all(count >= 1 for count in self.channels),
-             'the network has three convolutions, each with at least one channel', self.channels),
-            (self.features >= 1 and self.hidden >= 1,
-             'features and hidden are positive', (self.features, self.hidden)),
-            (0 <= self.blocks <= 4, 'a stage has 0 to 4 residual blocks', self.blocks),
-            (1 <= self.frames <= 8, 'a stack has 1 to 8 frames', self.frames),
-            (set(self.heads) <= set(HEADS) and len(set(self.heads)) == len(self.heads),
-             f'heads are some of {", ".join(HEADS)}, each once', self.heads),
-            (self.deconvolutions in (1, 2), 'heads have one or two deconvolutions',
-             self.deconvolutions),
-            (not self.pose_to_memory or 'goal_pose' in self.heads,
-             'pose_to_memory needs the head goal_pose', self.heads),
-            (not self.moves or (self.pose_to_memory and self.frames == 1),
-             'a goal is tracked by a network with pose_to_memory and an LSTM', self.heads),
-            (not self.moves or (len(self.moves) == len(self.actions)
-                                and all(len(move) == 3 for move in self.moves)),
-             'there is a move (dx, dy, dyaw) for each action', self.moves),
-            (self.filter_name in FILTERS, f'the action filter is one of {", ".join(FILTERS)}',
-             self.action_filter),
-            (self.filter_name == NONE or self.moves,
-             'an action filter is told what the actions do: it needs moves', self.action_filter),
-            (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
-                                  and self.architecture != 'icra2017'),
-             'a policy with an LSTM has no place cells, or 2 to 1024', self.places),
-            (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
-            (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
-             'one', self.frozen),
-            (self.scenes >= 1, 'there is at least one scene', self.scenes),
-            (self.architecture == 'icra2017' or (not self.frozen and self.scenes == 1),
-             'a frozen encoder and layers of scenes belong to the architecture icra2017',
-             self.architecture),
-            (self.architecture != 'icra2017' or not self.heads,
-             'the architecture icra2017 has no heads beside actor and critic', self.heads),
-        )
-        for kept, rule, received in rules:
-            if not kept:
-                raise UserError(rule, received, 'correct the network configuration')
-
-    @property
-    def filter_name(self) -> str:
-        """The action filter, by its name in `vn_nav.policy.action_filter.FILTERS`."""
-        return self.action_filter or self._usual_filter
-
-    @property
-    def _usual_filter(self) -> str:
-        return BLOCKED_ACTIONS if self.moves else NONE
 
 
 class PolicyOutput(NamedTuple):
@@ -174,6 +73,14 @@ class Policy(nn.Module):
     """
 
     frozen = False
+    encoder: Encoder | Siamese
+    memory: Feedforward | MaskedLSTM | SceneLinear
+    actor: nn.Linear | SceneLinear
+    critic: nn.Linear | SceneLinear
+    tracker: GoalTracker | None
+    places: PlaceClassifier | None
+    routes: Routes | None
+    around: MultiViewAveraging | None
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -186,20 +93,22 @@ class Policy(nn.Module):
         if config.architecture == 'icra2017':
             raise UserError('a policy of icra2017 is made by zhu_policy.build_policy',
                             config.architecture, 'call that')
-        pixels = {'mean': config.pixel_mean, 'std': config.pixel_std, 'frames': config.frames}
-        own = {'fused': Fused, 'matching': Matching}.get(config.architecture)
-        if own is not None:
-            self.encoder = own(config.size, config.channels, config.features, config.blocks,
-                               **pixels)
+        pixels = config.pixel_mean, config.pixel_std, config.frames
+        thesis = config.architecture in ('thesis', 'unreal')
+        encoder: Encoder
+        if thesis:
+            published: type[TwoStreams | OneStream] = (
+                TwoStreams if config.architecture == 'thesis' else OneStream)
+            encoder = published(config.size, *pixels)
         else:
-            encoder = {'thesis': TwoStreams, 'unreal': OneStream}[config.architecture]
-            self.encoder = encoder(config.size, **pixels)
-        inputs = (self.encoder.features + len(config.actions) + 1
+            own: type[Fused | Matching] = Fused if config.architecture == 'fused' else Matching
+            encoder = own(config.size, config.channels, config.features, config.blocks, *pixels)
+        self.encoder = encoder
+        inputs = (encoder.features + len(config.actions) + 1
                   + (5 if config.pose_to_memory else 0)
                   + (GoalTracker.WIDTH if config.moves else 0)
                   + (WIDTH if config.places else 0))
         self.tracker = GoalTracker(config.moves) if config.moves else None
-        thesis = own is None
         if config.frames > 1:
             self.memory = Feedforward(inputs, config.hidden)
         else:
@@ -212,26 +121,18 @@ class Policy(nn.Module):
                                           config.pixel_std)
             self.routes = Routes(self.places.width, len(config.actions))
             with torch.no_grad():
-                self._goal_shape = self.encoder.encode_goals(
+                self._goal_shape = encoder.encode_goals(
                     torch.zeros(1, 3, config.size, config.size, dtype=torch.uint8),
                     torch.float32).shape[1:]
-        self.actor = nn.Linear(config.hidden, len(config.actions))
-        self.critic = nn.Linear(config.hidden, 1)
-        self._initialise(thesis)
-        channels, side = self.encoder.maps
+        self.actor = actor = nn.Linear(config.hidden, len(config.actions))
+        self.critic = critic = nn.Linear(config.hidden, 1)
+        for layer, gain in ((actor, 0.01), (critic, 1.0)):
+            _initialise(layer, gain, thesis)
+        channels, side = encoder.maps
         self.target_side = grown(side, config.deconvolutions)
         self.cell = max(config.size // self.target_side, 1)
         self.heads = nn.ModuleDict({name: self._head(name, channels, side)
                                     for name in config.heads})
-
-    def _initialise(self, thesis: bool) -> None:
-        for layer, gain in ((self.actor, 0.01), (self.critic, 1.0)):
-            if thesis:
-                bound = layer.in_features**-0.5
-                nn.init.uniform_(layer.weight, -bound, bound)
-            else:
-                nn.init.orthogonal_(layer.weight, gain)
-            nn.init.zeros_(layer.bias)
 
     def _head(self, name: str, channels: int, side: int) -> nn.Module:
         config = self.config
@@ -341,12 +242,14 @@ class Policy(nn.Module):
             hidden, tracked, looked = state.hidden.split((self.config.hidden, *self._beside), 1)
             own = RecurrentState(hidden, state.cell)
         if self.tracker is not None:
+            assert pose is not None  # moves are given with pose_to_memory alone
             seen, tracked = self.tracker(
                 *(part.detach().view(steps, batch, *part.shape[1:]) for part in pose),
                 obs.last_action, starts, tracked)
             inputs.append(seen.to(dtype))
             beside.append(tracked)
         if self.places is not None:
+            assert self.routes is not None and goal_places is not None  # made with the places
             if obs.goal_index is not None:
                 goal_places = goal_places[obs.goal_index.flatten()]
             here = self.places(obs.image.flatten(0, 1), self.compute_dtype)
@@ -424,6 +327,15 @@ class Policy(nn.Module):
         return self.read(latents), state
 
 
+def _initialise(layer: nn.Linear, gain: float, thesis: bool) -> None:
+    if thesis:
+        bound = layer.in_features**-0.5
+        nn.init.uniform_(layer.weight, -bound, bound)
+    else:
+        nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+
+
 def _compass(pose: Pose) -> Tensor:
     """What the memory sees of a pose, [N,5]: vague where the pictures share nothing.
 
@@ -446,7 +358,7 @@ class GoalMaps:
 
     def of(self, goals: Tensor, goal_index: Tensor) -> Tensor:
         """[N,...] for the goals `goals`[goal_index]; the network then takes None as the index."""
-        if self._index is None:
+        if self._index is None or self._maps is None:  # nothing is kept yet
             self._maps = self.network.encode_goals(goals[goal_index])
         else:
             changed = torch.nonzero(goal_index != self._index).squeeze(1)

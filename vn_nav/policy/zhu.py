@@ -69,7 +69,8 @@ class Siamese(nn.Module):
     def __init__(self, frozen: str, frames: int, width: int):
         super().__init__()
         self.frames, self.features = frames, width
-        self.frozen = ResNet50() if frozen == 'resnet50' else RandomFeatures()
+        self.frozen: ResNet50 | RandomFeatures = (
+            ResNet50() if frozen == 'resnet50' else RandomFeatures())
         self.shared = nn.Linear(frames * self.frozen.features, width)
         self.fuse = nn.Linear(2 * width, width)
         for layer in (self.shared, self.fuse):

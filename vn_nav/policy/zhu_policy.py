@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import Latents, NetworkConfig, Policy, PolicyOutput
+from vn_nav.policy.network import Latents, Policy, PolicyOutput
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.zhu import SceneLinear, Siamese
 
 
@@ -24,6 +25,7 @@ class ScenePolicy(Policy):
     """The network of Zhu et al., see `vn_nav.policy.zhu`."""
 
     frozen = True
+    encoder: Siamese
 
     def _build(self, config: NetworkConfig) -> None:
         width = config.hidden
@@ -71,8 +73,9 @@ class ScenePolicy(Policy):
         """[T,B] whose layers see the observations."""
         if self.config.scenes == 1:
             return torch.zeros_like(obs.last_action)
-        if 'scene' not in (obs.extras or {}):
+        extras = obs.extras or {}
+        if 'scene' not in extras:
             raise UserError('a network with layers for several scenes is told the scene',
                             "observations without extras['scene']", 'pass it, or train and use '
                             'a network of one scene')
-        return obs.extras['scene']
+        return extras['scene']

@@ -1,0 +1,110 @@
+"""Everything that fixes a network's shape, and what its parts may be."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from vn_nav.errors import UserError
+from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
+from vn_nav.policy.zhu import FROZEN
+
+ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
+# Channels that each image head draws, and the width of its inner maps. The thesis says that depth
+# has "only" 32, so the segmentation heads are wider.
+IMAGE_HEADS = {'depth': (1, 32), 'segmentation': (3, 64), 'goal_segmentation': (3, 64),
+               'reconstruction': (3, 32)}
+HEADS = ('pixel_control', 'reward_prediction', *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance')
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Everything that fixes the network's shape; stored in the checkpoint."""
+
+    actions: tuple[str, ...]
+    size: int = 84  # pixels a side
+    architecture: str = 'fused'  # of ARCHITECTURES, see `vn_nav.policy.encoders` and `zhu`
+    channels: tuple[int, int, int] = (32, 64, 32)  # of the fused encoder
+    blocks: int = 0  # residual blocks a stage of the fused encoder
+    features: int = 256  # of the fused encoder's trunk
+    hidden: int = 256  # of the LSTM
+    frames: int = 1  # more: pictures stacked as channels, and no LSTM
+    heads: tuple[str, ...] = ()  # of HEADS
+    deconvolutions: int = 1  # of pixel control and image heads: 84 px give 20 x 20, or 42 x 42
+    pose_to_memory: bool = False  # the memory also sees what the head goal_pose says
+    # [A,3] dx, dy [m], dyaw [rad] of the actions: with them the memory also sees where the goal
+    # stands by dead reckoning since it was seen, see `GoalTracker`. Empty: it does not.
+    moves: tuple[tuple[float, float, float], ...] = ()
+    # Place cells of the one place that the policy recognises; more than none: the memory also sees
+    # where there picture and goal were taken, see `vn_nav.policy.places`.
+    places: int = 0
+    # Of `vn_nav.policy.action_filter.FILTERS`: what whoever chooses actions by the logits puts in
+    # between, no part of the network. '': blocked actions where there are moves, as it was before
+    # checkpoints said so; else none.
+    action_filter: str = ''
+    # Grey levels. Standardised input is what made learning work; whole numbers up to 256 less a
+    # whole mean stay exact in bfloat16.
+    pixel_mean: float = 120.0
+    pixel_std: float = 36.0
+    # Of icra2017 alone.
+    frozen: str = ''  # encoder, of `vn_nav.policy.zhu.FROZEN`
+    scenes: int = 1  # that have layers of their own
+
+    def __post_init__(self):
+        for name in ('actions', 'channels', 'heads'):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, 'moves', tuple(map(tuple, self.moves)))
+        if self.action_filter == self._usual_filter:  # said or not, it is the same
+            object.__setattr__(self, 'action_filter', '')
+        rules = (
+            (len(self.actions) >= 2 and len(set(self.actions)) == len(self.actions),
+             'a policy has at least two actions with distinct names', self.actions),
+            (isinstance(self.size, int) and 36 <= self.size <= 1024,
+             'the network takes pictures of 36 to 1024 pixels a side', self.size),
+            (self.architecture in ARCHITECTURES,
+             f'the architecture is one of {", ".join(ARCHITECTURES)}', self.architecture),
+            (len(self.channels) == 3 and all(count >= 1 for count in self.channels),
+             'the network has three convolutions, each with at least one channel', self.channels),
+            (self.features >= 1 and self.hidden >= 1,
+             'features and hidden are positive', (self.features, self.hidden)),
+            (0 <= self.blocks <= 4, 'a stage has 0 to 4 residual blocks', self.blocks),
+            (1 <= self.frames <= 8, 'a stack has 1 to 8 frames', self.frames),
+            (set(self.heads) <= set(HEADS) and len(set(self.heads)) == len(self.heads),
+             f'heads are some of {", ".join(HEADS)}, each once', self.heads),
+            (self.deconvolutions in (1, 2), 'heads have one or two deconvolutions',
+             self.deconvolutions),
+            (not self.pose_to_memory or 'goal_pose' in self.heads,
+             'pose_to_memory needs the head goal_pose', self.heads),
+            (not self.moves or (self.pose_to_memory and self.frames == 1),
+             'a goal is tracked by a network with pose_to_memory and an LSTM', self.heads),
+            (not self.moves or (len(self.moves) == len(self.actions)
+                                and all(len(move) == 3 for move in self.moves)),
+             'there is a move (dx, dy, dyaw) for each action', self.moves),
+            (self.filter_name in FILTERS, f'the action filter is one of {", ".join(FILTERS)}',
+             self.action_filter),
+            (self.filter_name == NONE or self.moves,
+             'an action filter is told what the actions do: it needs moves', self.action_filter),
+            (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
+                                  and self.architecture != 'icra2017'),
+             'a policy with an LSTM has no place cells, or 2 to 1024', self.places),
+            (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
+            (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
+             'one', self.frozen),
+            (self.scenes >= 1, 'there is at least one scene', self.scenes),
+            (self.architecture == 'icra2017' or (not self.frozen and self.scenes == 1),
+             'a frozen encoder and layers of scenes belong to the architecture icra2017',
+             self.architecture),
+            (self.architecture != 'icra2017' or not self.heads,
+             'the architecture icra2017 has no heads beside actor and critic', self.heads),
+        )
+        for kept, rule, received in rules:
+            if not kept:
+                raise UserError(rule, received, 'correct the network configuration')
+
+    @property
+    def filter_name(self) -> str:
+        """The action filter, by its name in `vn_nav.policy.action_filter.FILTERS`."""
+        return self.action_filter or self._usual_filter
+
+    @property
+    def _usual_filter(self) -> str:
+        return BLOCKED_ACTIONS if self.moves else NONE
