@@ -338,7 +338,7 @@ def test_unknown_scenes_are_refused():
     assert acted.shape == (3,)
     with pytest.raises(UserError, match='scene 3'):
         policy.act(observation, env.goals, info['reset'], np.array([0, 3, 1]))
-    with pytest.raises(UserError, match='is told the scene'):
+    with pytest.raises(UserError, match='needs the scene'):
         policy.act(observation, env.goals, info['reset'])
     assert scene_numbers([8, 7, 8], [7, 8]).tolist() == [1, 0, 1]
     with pytest.raises(UserError, match='house 9'):

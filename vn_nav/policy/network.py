@@ -32,7 +32,7 @@ from vn_nav.policy.memory import (
     RecurrentState,
     stack_frames,
 )
-from vn_nav.policy.places import WIDTH, MultiViewAveraging, PlaceClassifier, Routes
+from vn_nav.policy.places import WIDTH, MultiViewAveraging, PathAdvice, PlaceClassifier
 from vn_nav.policy.zhu import FROZEN
 
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
@@ -112,7 +112,7 @@ class NetworkConfig:
             (self.filter_name in FILTERS, f'the action filter is one of {", ".join(FILTERS)}',
              self.action_filter),
             (self.filter_name == NONE or self.moves,
-             'an action filter is told what the actions do: it needs moves', self.action_filter),
+             'an action filter needs the moves (displacement of each action)', self.action_filter),
             (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
                                   and self.architecture != 'icra2017'),
              'a policy with an LSTM has no place cells, or 2 to 1024', self.places),
@@ -124,7 +124,7 @@ class NetworkConfig:
              'a frozen encoder and layers of scenes belong to the architecture icra2017',
              self.architecture),
             (self.architecture != 'icra2017' or not self.heads,
-             'the architecture icra2017 has no heads beside actor and critic', self.heads),
+             'the architecture icra2017 has no heads other than actor and critic', self.heads),
         )
         for kept, rule, received in rules:
             if not kept:
@@ -210,7 +210,7 @@ class Policy(nn.Module):
                 self.around = MultiViewAveraging(config.moves, config.places)
             self.places = PlaceClassifier(config.size, config.places, config.pixel_mean,
                                           config.pixel_std)
-            self.routes = Routes(self.places.width, len(config.actions))
+            self.routes = PathAdvice(self.places.width, len(config.actions))
             with torch.no_grad():
                 self._goal_shape = self.encoder.encode_goals(
                     torch.zeros(1, 3, config.size, config.size, dtype=torch.uint8),

@@ -146,7 +146,7 @@ def scene_numbers(houses: Sequence[int], known: Sequence[int]) -> np.ndarray:
     """
     for seed in houses:
         if seed not in known:
-            raise UserError('a network with layers for several scenes knows the houses '
+            raise UserError('a network with layers for several scenes supports the houses '
                             f'{", ".join(map(str, known))} alone', f'house {seed}',
                             'evaluate it there, or train one with a single scene')
     return np.array([list(known).index(seed) for seed in houses], np.int64)

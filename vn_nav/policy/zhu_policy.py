@@ -72,7 +72,7 @@ class ScenePolicy(Policy):
         if self.config.scenes == 1:
             return torch.zeros_like(obs.last_action)
         if 'scene' not in (obs.extras or {}):
-            raise UserError('a network with layers for several scenes is told the scene',
+            raise UserError('a network with layers for several scenes needs the scene',
                             "observations without extras['scene']", 'pass it, or train and use '
                             'a network of one scene')
         return obs.extras['scene']
