@@ -121,7 +121,7 @@ def test_several_places_are_refused_with_the_stretches_and_how_to_take_one():
     check_frame(part(100))
     # What odometry does not say.
     hidden = np.repeat([0, 1], [60, 40])
-    with pytest.raises(UserError, match=r'61-100 \(1:00 to 1:39, because no picture from here'):
+    with pytest.raises(UserError, match=r'61-100 \(1:00 to 1:39, because from here on no picture'):
         check_place(part(100), straightened(hidden, [0, 1]))
     # Closures that bend odometry further than any drive does.
     with pytest.raises(UserError, match=r'after picture 100 \(1:39\).*up to 10.0 m'):
