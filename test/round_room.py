@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from vn_nav.bags.dataset import DriveSet
-from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.drive import NO_ACTION
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
@@ -85,10 +85,10 @@ def drive_set(episodes: int, seed: int = 0, *, depth: bool = True, labels: bool 
         poses, actions = np.zeros((0, 3)), []
         while len(poses) < max(length, 2):
             more, done = drive(rng)
-            actions += [MISFIT] * bool(len(poses)) + done  # the drives do not join
+            actions += [NO_ACTION] * bool(len(poses)) + done  # the drives do not join
             poses = np.concatenate([poses, more])
         poses = poses[:length or None]
-        actions = [*actions[:len(poses) - 1], MISFIT]
+        actions = [*actions[:len(poses) - 1], NO_ACTION]
         rows += [(*pose, action, number) for pose, action in zip(poses, actions, strict=True)]
     table = np.array(rows)
     image, metres, classes = look(table[:, :3], size)

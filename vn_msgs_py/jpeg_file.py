@@ -26,7 +26,7 @@ MAX_SCANS = 64  # encoders write 1 to 20
 MAX_SCANNED_PX = 40 * MAX_PIXELS  # pixels times scans: each scan passes over the whole picture
 MAX_COEFFICIENT_BYTES = 150_000_000  # what a decoder keeps of a picture in several scans
 UNIT_BYTES = 128  # of coefficients a data unit
-WINDOW = 1 << 18  # bytes searched at once for the end of a scan
+SEARCH_BYTES = 1 << 18  # bytes searched at once for the end of a scan
 EXIF = b'Exif\0\0'
 BASELINE, EXTENDED, PROGRESSIVE = 0xC0, 0xC1, 0xC2
 OTHER_FRAMES = {0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF, 0xDE}
@@ -42,7 +42,7 @@ class JpegFile(NamedTuple):
     width: int
     components: int  # 1: grey
     orientation: int  # EXIF, 1 to 8
-    end: int  # bytes up to and with the end marker; what follows is somebody else's
+    end: int  # bytes up to and with the end marker; what follows is not part of it
 
 
 class _Frame:
@@ -176,7 +176,7 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
 def _scan_end(view: np.ndarray, at: int) -> int:
     """Where the first marker is that ends the coded data from `at` on."""
     while at + 1 < len(view):
-        part = view[at:at + WINDOW]
+        part = view[at:at + SEARCH_BYTES]
         marks = (part[:-1] == 0xFF) & (part[1:] != 0)
         first = int(marks.argmax())
         if marks[first]:

@@ -97,7 +97,7 @@ def _read_header(fields: bytes) -> tuple[int, int, int, int, bool]:
         '>IIBBBBB', fields)
     check_size(height, width)
     if depth not in DEPTHS.get(colour, ()) or compression or filtering or interlace > 1:
-        raise damaged('a PNG header is of a kind that there is',
+        raise damaged('a PNG header has a valid colour type and bit depth',
                       (depth, colour, compression, filtering, interlace))
     return height, width, depth, colour, bool(interlace)
 

@@ -51,7 +51,7 @@ TOPICS = (
     Topic('cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
           'velocity command; TwistStamped with enable_stamped_cmd_vel', depth=1),
     Topic('shadow/cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
-          'mode shadow, in place of cmd_vel: no base listens there', depth=1),
+          'mode shadow, in place of cmd_vel: no base subscribes to it', depth=1),
     Topic('executed_action', _STRING, 'user',
           'mode shadow: JSON: the stamp of a picture where a decision is wanted, and the action '
           'really done before it'),
@@ -59,8 +59,8 @@ TOPICS = (
     _history('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
     _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),
     _latched('arrived', 'std_msgs/msg/Bool', 'policy',
-             'true: it says that it has arrived, and stands still; false: it does not, said anew '
-             'of every goal'),
+             'true: it declares arrival and stands still; false: it does not, published '
+             'again for every goal'),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy, bridge',
           'state and reasons'),
     _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),

@@ -249,7 +249,7 @@ def cannot_be_read(folder, kind):
 @pytest.mark.parametrize('listed', [False, True])
 @pytest.mark.parametrize('kind, words', [
     ('link', 'is a link to /gone/r_1.mcap, which is not there.*cp -rL'), ('folder', 'is a folder'),
-    ('pipe', 'is no file'), ('empty', 'is empty')])
+    ('pipe', 'is not a file'), ('empty', 'is empty')])
 def test_a_file_that_cannot_be_read_is_named(tmp_path, kind, words, listed):
     path = cannot_be_read(tmp_path / 'bag', kind)
     if listed:

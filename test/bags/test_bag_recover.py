@@ -68,7 +68,7 @@ def test_a_damaged_bag_loses_its_chunk_and_says_so(tmp_path, capsys):
 def test_nothing_is_overwritten_and_nothing_is_left_behind(tmp_path):
     path = write(tmp_path / 'a.mcap', drive(0.5))
     (tmp_path / 'out').mkdir()
-    with pytest.raises(UserError, match='new place'):
+    with pytest.raises(UserError, match='new folder'):
         recover(path, tmp_path / 'out')
     folder = tmp_path / 'bag'
     folder.mkdir()

@@ -12,9 +12,17 @@ from ros_harness import write_checkpoint
 from small_bags import FIXTURE, IMAGE, START, drive, odometry, picture, write
 
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import MISFIT, Frame
+from vn_nav.bags.drive import NO_ACTION, Frame
 from vn_nav.bags.report.agreement import END, OTHER, STOP, judge
-from vn_nav.bags.report.figures import BINS, POINTS, STRIP, Film, Odometer, Timeline, Ways
+from vn_nav.bags.report.figures import (
+    MAX_BINS,
+    MAX_PATH_POINTS,
+    MAX_STRIP_PICTURES,
+    Film,
+    Odometer,
+    Timeline,
+    Ways,
+)
 from vn_nav.bags.report.page import _series, show_page
 from vn_nav.bags.report.show import show
 from vn_nav.bags.roles import Topics
@@ -109,7 +117,7 @@ def test_the_film_and_the_path_are_where_the_robot_was(tmp_path):
     assert sorted(shown.ways) == [0, 1] and shown.goals.count == len(shown.goals.shown) == 2
     assert shown.odometer.metres == pytest.approx(3.0, abs=0.1)
     assert shown.odometer.turned == pytest.approx(math.pi, abs=0.1)
-    assert len(shown.film) == STRIP
+    assert len(shown.film) == MAX_STRIP_PICTURES
     poses = {round(m[2] * 1e-9, 3): m[3].pose.pose.position for m in turning_drive()
              if m[0] == '/odom'}
     for shot in shown.film:
@@ -155,7 +163,7 @@ def test_a_timeline_keeps_its_sums_when_it_runs_out_of_room():
     for at, number in zip(times, numbers, strict=True):
         line.add('a', int(at), float(number))
     centres, values = line.values('a')
-    assert len(centres) <= BINS and line.width == 32
+    assert len(centres) <= MAX_BINS and line.width == 32
     own = ((times - times[0]) * 1e-9 / line.width).astype(int)
     for k in np.unique(own):
         here = numbers[own == k]
@@ -177,26 +185,27 @@ def test_what_is_kept_of_a_long_drive_is_bounded():
         odometer.go(one)
         film.add(one, odometer.progress)
         ways.add(one)
-        assert len(film._shots) < 4 * STRIP and ways._points <= 2.5 * POINTS
+        assert len(film._shots) < 4 * MAX_STRIP_PICTURES and ways._points <= 2.5 * MAX_PATH_POINTS
     shots = film.shots()
-    assert len(shots) == STRIP and shots[0].time == 0 and shots[-1].time == pytest.approx(1999.9)
+    assert len(shots) == MAX_STRIP_PICTURES and shots[0].time == 0
+    assert shots[-1].time == pytest.approx(1999.9)
     gaps = np.diff([shot.progress for shot in shots])
     assert gaps.max() < 2 * gaps.min()
     way = ways.ways()
-    assert sorted(way) == [0, 1, 2, 3] and sum(map(len, way.values())) <= POINTS + 4
+    assert sorted(way) == [0, 1, 2, 3] and sum(map(len, way.values())) <= MAX_PATH_POINTS + 4
     assert all(np.allclose(np.hypot(*w[:, :2].T), 3) for w in way.values())
     assert odometer.metres == pytest.approx(20_000 * 0.006, rel=0.01)
 
 
 def test_episodes_without_end_are_bounded_and_a_standing_robot_shows_one_picture():
     film, ways, odometer = Film(), Ways(), Odometer()
-    for k in range(3 * POINTS):
+    for k in range(3 * MAX_PATH_POINTS):
         one = frame(k, (k % 7, 0, 0), k)
         odometer.go(one)
         film.add(one, odometer.progress)
         ways.add(one)
-    assert sum(map(len, ways.ways().values())) <= POINTS and odometer.metres == 0
-    assert len(film.shots()) == STRIP
+    assert sum(map(len, ways.ways().values())) <= MAX_PATH_POINTS and odometer.metres == 0
+    assert len(film.shots()) == MAX_STRIP_PICTURES
     film = Film()
     for k in range(100):
         film.add(frame(k, (0, 0, 0)), 0.0)
@@ -213,20 +222,20 @@ def test_a_policy_is_told_what_was_done_and_judged_as_in_training(tmp_path):
     for steps in drives.episodes():
         # The same in one go, as the learner does it.
         done = drives.action[steps].astype(np.int64)
-        before = np.concatenate([[MISFIT], done[:-1]])
+        before = np.concatenate([[NO_ACTION], done[:-1]])
         goals = torch.from_numpy(np.array(drives.goals[drives.goal[steps][-1:]]))
         network = checkpoint.network
         with torch.inference_mode():
             output, _ = network(
                 Observation(torch.from_numpy(np.array(drives.image[steps]))[:, None], None, None,
                             torch.from_numpy(before)[:, None], torch.zeros(len(done), 1)),
-                torch.from_numpy(before == MISFIT)[:, None], network.initial_state(1),
+                torch.from_numpy(before == NO_ACTION)[:, None], network.initial_state(1),
                 network.encode_goals(goals))
         sure = torch.softmax(output.logits[:, 0], -1).numpy()
         for k, judged in enumerate(found.steps[at:at + len(done)]):
             assert judged.sure == pytest.approx(sure[k].max(), abs=1e-5)
             assert judged.would == DRIVE_ACTIONS[sure[k].argmax()]
-            if done[k] != MISFIT:
+            if done[k] != NO_ACTION:
                 assert judged.done == DRIVE_ACTIONS[done[k]]
                 assert judged.done_sure == pytest.approx(sure[k][done[k]], abs=1e-5)
             else:

@@ -207,7 +207,7 @@ def test_other_formats_are_refused_with_a_remedy(tmp_path):
             (folder('ros1', None, 'x.bag'), 'rosbags-convert'),
             (folder('whole', info % ('x.mcap.zstd', 'FILE')), 'zstd -d'),
             (folder('each', info % ('x.mcap', 'MESSAGE')), 'one by one'),
-            (folder('outside', info % ('../../etc/passwd', '')), 'within the folder'),
+            (folder('outside', info % ('../../etc/passwd', '')), 'outside the folder'),
             (folder('gone', info % ('x.mcap', '')), 'not there'),
             (folder('deep', '[' * 900_000), 'not the metadata'),
             (folder('nested', '- ' * 5_000), 'not the metadata'),

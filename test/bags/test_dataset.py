@@ -13,7 +13,7 @@ from small_bags import IMAGE, START, drive, picture, write
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags import dataset
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.drive import NO_ACTION
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.storage.reader import read_bag
 from vn_nav.errors import UserError
@@ -32,7 +32,7 @@ def drives(tmp_path_factory):
 def test_the_actions_of_a_recorded_policy_are_found_in_its_odometry(drives):
     names = json.loads(next(iter(read_bag(BAG, ('action_names',)))).message.data)
     recorded = [names[r.message.data] for r in read_bag(BAG, ('action',))]
-    cut = [DRIVE_ACTIONS[a] for a in drives.action if a != MISFIT]
+    cut = [DRIVE_ACTIONS[a] for a in drives.action if a != NO_ACTION]
     # Where the last action leads to is not always recorded any more.
     assert cut == recorded[:len(cut)] and len(recorded) - 1 <= len(cut) >= 5
     assert drives.facts['misfits'] == 0
@@ -78,7 +78,7 @@ def test_the_second_time_it_comes_from_the_cache_and_a_changed_bag_does_not(
 def test_every_picture_can_be_had_too(tmp_path, drives):
     every = load_drives(BAG, dataclasses.replace(WANTED, every=True), tmp_path)
     assert len(every) == every.facts['pictures'] - every.facts['without_pose'] > len(drives)
-    assert (every.action == MISFIT).all()
+    assert (every.action == NO_ACTION).all()
 
 
 def test_a_bag_that_cannot_be_learned_from_is_refused(tmp_path):

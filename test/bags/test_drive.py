@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from vn_msgs_py.motion import yaw_to_quaternion
-from vn_nav.bags.drive import MISFIT, Cutter, Report, integrate, synchronise
+from vn_nav.bags.drive import NO_ACTION, ActionSegmenter, Report, integrate, synchronise
 from vn_nav.bags.drive import TimestampedMessage as Message
 from vn_nav.bags.roles import TYPES, Topics, full_name, load_topics
 from vn_nav.bags.stamped import Stamped
@@ -77,7 +77,7 @@ def frames_of(messages, topics=TOPICS):
 
 def steps_of(messages, robot=ROBOT, topics=TOPICS):
     report = Report()
-    return list(Cutter(robot, report).cut(synchronise(messages, topics, report))), report
+    return list(ActionSegmenter(robot, report).cut(synchronise(messages, topics, report))), report
 
 
 def test_every_picture_gets_the_pose_of_its_own_stamp():
@@ -188,7 +188,7 @@ def test_curves_that_fit_no_action_are_counted_and_the_poses_go_on():
     assert report.misfits == 0 and report.actions[0] >= 3
     tight, report = steps_of(drive([(0.3, 0.25, 8.0)])[0])
     assert report.misfits >= 3 and report.misfit_share > 0.5
-    assert {step.action for step in tight} >= {MISFIT}
+    assert {step.action for step in tight} >= {NO_ACTION}
     for step, following in zip(tight, tight[1:], strict=False):
         assert np.hypot(*(following.frame.pose - step.frame.pose)[:2]) < 0.8
 

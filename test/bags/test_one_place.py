@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from small_bags import ODOMETRY, START, odometry, write
 
-from vn_nav.bags.continuity import SILENCE, Break, divide, find_breaks
-from vn_nav.bags.mapping.loop_closure import Straightened
+from vn_nav.bags.continuity import ODOMETRY_GAP_S, Break, divide, find_breaks
+from vn_nav.bags.mapping.loop_closure import OptimisedOdometry
 from vn_nav.bags.mapping.one_place import Part, check_frame, check_place, choose, parse_pictures
-from vn_nav.bags.mapping.same_place import NEVER, together, unnoticed
+from vn_nav.bags.mapping.same_place import MIN_UNMATCHED_PAIRS, together, unnoticed
 from vn_nav.errors import UserError
 
 TICK = 50_000_000  # ns
@@ -33,9 +33,9 @@ def breaks(tmp_path, *rows):
     ((1.05, 0.3, 0.0, 'map'), "changes from 'odom' to 'map'"),
     ((0.0, 0.0, 0.0, 'odom'), 'goes back by 1.0 s'),
     ((1.0, 0.3, 0.0, 'odom'), None),  # twice the same
-    ((1.5 + SILENCE, 0.3, 0.0, 'odom'), None),  # it stood there
-    ((1.5 + SILENCE, 1.3, 0.0, 'odom'), 'silent for 10 s and then 1.0 m away'),
-    ((0.9 + SILENCE, 1.3, 0.0, 'odom'), None)])
+    ((1.5 + ODOMETRY_GAP_S, 0.3, 0.0, 'odom'), None),  # it stood there
+    ((1.5 + ODOMETRY_GAP_S, 1.3, 0.0, 'odom'), 'silent for 10 s and then 1.0 m away'),
+    ((0.9 + ODOMETRY_GAP_S, 1.3, 0.0, 'odom'), None)])
 def test_what_no_robot_drives_is_a_break(then, reason, tmp_path):
     found = breaks(tmp_path, (0.95, 0.28, 0.0, 'odom'), (1.0, 0.3, 0.0, 'odom'), then,
                    (then[0] + 0.05, then[1], then[2], then[3]))
@@ -78,9 +78,9 @@ def test_a_place_that_never_looks_as_it_did_is_another_one():
     alike = rng.random(400) < 0.85
     assert unnoticed(first, second, alike) is None
     across = (first < 47) & (second >= 47)
-    assert across.sum() > 2 * NEVER
+    assert across.sum() > 2 * MIN_UNMATCHED_PAIRS
     assert unnoticed(first, second, alike & ~across) == 47
-    few = np.flatnonzero(across)[NEVER - 1:]  # too few to tell
+    few = np.flatnonzero(across)[MIN_UNMATCHED_PAIRS - 1:]  # too few to tell
     kept = np.setdiff1d(np.arange(400), few)
     assert unnoticed(first[kept], second[kept], (alike & ~across)[kept]) is None
     assert unnoticed(first[:0], second[:0], alike[:0]) is None
@@ -100,7 +100,7 @@ def part(*lengths, vouched=False):
 
 
 def straightened(own, place, **facts):
-    return Straightened(np.zeros((len(own), 3)), None, np.array(own), np.array(place),
+    return OptimisedOdometry(np.zeros((len(own), 3)), None, np.array(own), np.array(place),
                         {'strain': 0.0, 'moved': 10.0, 'strained': 99} | facts)
 
 
@@ -121,7 +121,7 @@ def test_several_places_are_refused_with_the_stretches_and_how_to_take_one():
     check_frame(part(100))
     # What odometry does not say.
     hidden = np.repeat([0, 1], [60, 40])
-    with pytest.raises(UserError, match=r'61-100 \(1:00 to 1:39, because no picture from here'):
+    with pytest.raises(UserError, match=r'61-100 \(1:00 to 1:39, because from here on no picture'):
         check_place(part(100), straightened(hidden, [0, 1]))
     # Closures that bend odometry further than any drive does.
     with pytest.raises(UserError, match=r'after picture 100 \(1:39\).*up to 10.0 m'):

@@ -9,7 +9,7 @@ import torch
 from round_room import ROBOT, drive_set
 from small_bags import FIXTURE
 
-from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.drive import NO_ACTION
 from vn_nav.cli import main
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.learning.bag_mix import WINDOW, BagMix, _Endless
@@ -146,7 +146,7 @@ def test_what_bags_cannot_teach_is_left_out_and_said():
     assert bags.parts == ('goal_pose', 'cloning', 'arrival', 'distance')
     assert any('depth is left out' in words for words in bags.words)
     still = drive_set(4)
-    still.action[:] = MISFIT
+    still.action[:] = NO_ACTION
     assert BagMix(Drives([still], ROBOT), CONFIG).parts == (
         'depth', 'segmentation', 'goal_segmentation', 'goal_pose')
     alone = dataclasses.replace(CONFIG, bag_imitation=0.0, bag_goal_pose=0.0, bag_image=0.0,

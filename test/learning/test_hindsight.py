@@ -8,7 +8,7 @@ from round_room import ROBOT, drive_set, look
 
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.bags.dataset import DriveSet
-from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.drive import NO_ACTION
 from vn_nav.co_visibility import co_visible, lift
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import (
@@ -29,7 +29,7 @@ STEPS = 100  # of a robot in a house
 def some_drives(*, depth=True):
     """Two bags, one with and one without a motion that fits no action."""
     first, second = drive_set(5, depth=depth), drive_set(4, seed=1, depth=depth)
-    second.action[3] = MISFIT
+    second.action[3] = NO_ACTION
     return Drives([first, second], ROBOT)
 
 
@@ -109,7 +109,7 @@ def house_drive(houses=(3, 4)):
     last[STEPS - 1::STEPS] = True
     return DriveSet(
         image=image, pose=pose, time=np.arange(len(image)) * 1.0,
-        action=np.where(last, MISFIT, action).astype(np.int16),
+        action=np.where(last, NO_ACTION, action).astype(np.int16),
         episode=np.cumsum(last) - last, goal=np.full(len(image), -1), goals=image[:0],
         depth=np.where(depth > 0, np.clip(depth * 25.5, 1, 255), 0).astype(np.uint8),
         labels=None, facts={})
@@ -143,7 +143,7 @@ def test_partners_are_others_of_the_same_span_and_half_of_them_near():
 @pytest.mark.parametrize('length, farthest', [(1, 1), (5, 3), (8, 48), (100, 100)])
 def test_windows_cover_every_action_once_and_are_those_of_a_plain_loop(length, farthest):
     drives = some_drives()
-    drives.action[slice(*drives.episodes[2])] = MISFIT  # nothing to imitate there
+    drives.action[slice(*drives.episodes[2])] = NO_ACTION  # nothing to imitate there
     spans = [*drives.episodes[:3], *drives.episodes[4:]]
     windows = draw_windows(drives, spans, length, farthest, np.random.default_rng(0))
     filled = fill_windows(drives, windows, length)
@@ -160,15 +160,15 @@ def test_windows_cover_every_action_once_and_are_those_of_a_plain_loop(length, f
                 continue
             action = drives.action[row]
             assert filled.rows[t, w] == row
-            assert filled.acts[t, w] == (action != MISFIT and row < goal)
+            assert filled.acts[t, w] == (action != NO_ACTION and row < goal)
             if filled.acts[t, w]:
                 covered.append(row)
                 assert filled.action[t, w] == action
-            fresh = t == 0 or drives.action[row - 1] == MISFIT
+            fresh = t == 0 or drives.action[row - 1] == NO_ACTION
             assert filled.starts[t, w] == fresh
             assert filled.last_action[t, w] == (-1 if fresh else drives.action[row - 1])
     acting = [row for first, end in spans for row in range(first, end - 1)
-              if drives.action[row] != MISFIT]
+              if drives.action[row] != NO_ACTION]
     assert sorted(covered) == acting
     again = draw_windows(drives, spans, length, farthest, np.random.default_rng(1))
     assert length == 1 or not np.array_equal(windows, again)
@@ -176,7 +176,7 @@ def test_windows_cover_every_action_once_and_are_those_of_a_plain_loop(length, f
 
 def test_windows_of_nothing_to_imitate_are_none():
     drives = some_drives()
-    drives.action[:] = MISFIT
+    drives.action[:] = NO_ACTION
     windows = draw_windows(drives, drives.episodes, 8, 8, np.random.default_rng(0))
     assert windows.shape == (0, 3)
 
@@ -202,7 +202,7 @@ def test_a_split_cuts_the_longest_episode_where_there_are_too_few(lengths):
 
 def test_drives_with_and_without_actions_are_both_judged():
     still = drive_set(20, seed=3)
-    still.action[:] = MISFIT
+    still.action[:] = NO_ACTION
     drives = Drives([drive_set(2, lengths=[50, 50]), still], ROBOT)
     told = split(drives, 0.2, seed=0)
     acting = [bool((drives.action[first:stop] >= 0).any()) for first, stop in told.validation]

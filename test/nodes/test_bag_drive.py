@@ -23,7 +23,7 @@ from small_bags import FIXTURE, IMAGE, ODOMETRY, START, drive, make, odometry, w
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.drive import NO_ACTION
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.bags.shadow.compare import (
     Answer,
@@ -113,7 +113,7 @@ def test_drives_with_nothing_in_common_are_refused(tmp_path):
 def test_a_decision_is_wanted_where_training_takes_a_picture(tmp_path):
     drives = load_drives(FIXTURE, Wanted(ROBOT), tmp_path)
     plan = make_plan(FIXTURE, ROBOT, Topics())
-    names = [None if a == MISFIT else DRIVE_ACTIONS[a] for a in drives.action]
+    names = [None if a == NO_ACTION else DRIVE_ACTIONS[a] for a in drives.action]
     assert [d.done for d in plan.decisions] == [None, *names[:-1]]
     assert [d.last for d in plan.decisions] == [False] * (len(names) - 1) + [True]
     assert plan.goals.shown == 1 and plan.rate == 20.0 and plan.camera_info is not None
@@ -249,11 +249,11 @@ def stranger():
 
 @pytest.mark.ros
 def test_a_domain_where_somebody_is_is_not_taken(stranger, monkeypatch):
-    monkeypatch.setattr(shadow_domain, 'ALONE', 60.0)  # it ends with the first that is heard of
+    monkeypatch.setattr(shadow_domain, 'DISCOVERY_S', 60.0)  # ends with the first one found
     stranger(231)
     with pytest.raises(UserError, match='231: .*stranger'):
         shadow_domain.Domain([231])
-    monkeypatch.setattr(shadow_domain, 'ALONE', 0.1)
+    monkeypatch.setattr(shadow_domain, 'DISCOVERY_S', 0.1)
     with (shadow_domain.Domain(range(225, 230)) as one,
           shadow_domain.Domain(range(225, 231)) as other):
         assert one.number != other.number and one.namespace != other.namespace
@@ -265,7 +265,7 @@ def alone(runtime, drives, robot):
     """What a policy says of a drive's steps, asked without ROS."""
     goal = drives.goals[drives.goal[-1]]
     runtime.set_goal(np.array(goal))
-    choices, before = [], MISFIT
+    choices, before = [], NO_ACTION
     for image, action in zip(drives.image, drives.action, strict=True):
         runtime.correct(before)
         choice = runtime.act(np.array(image))

@@ -42,7 +42,7 @@ def test_a_listener_of_the_other_twist_is_named_with_the_cure(checkpoint, tmp_pa
         base = rclpy.create_node('base', context=context)
         base.create_subscription(TwistStamped, 'cmd_vel', lambda _: None, 10)
         try:
-            status = robot.says('base listens for geometry_msgs/msg/TwistStamped')
+            status = robot.says('base subscribes to geometry_msgs/msg/TwistStamped')
             assert status[1] == DiagnosticStatus.ERROR
             assert 'set enable_stamped_cmd_vel to true' in status[2]
         finally:

@@ -1,4 +1,4 @@
-"""A move that has led nowhere is not tried again from there, and turning has an end."""
+"""A move without progress is not tried again from there, and turning has an end."""
 
 import copy
 import dataclasses
@@ -287,7 +287,7 @@ def test_changed_means_by_the_same_random_numbers():
 
 def test_a_filter_needs_moves_and_a_known_name():
     assert network_of(moves=()).config.filter_name == 'none'
-    for wrong, rule in (({'moves': (), 'action_filter': 'blocked_actions'}, 'needs moves'),
+    for wrong, rule in (({'moves': (), 'action_filter': 'blocked_actions'}, 'needs the moves'),
                         ({'action_filter': 'all'}, 'one of none, blocked_actions')):
         with pytest.raises(UserError, match=rule):
             network_of(**wrong)

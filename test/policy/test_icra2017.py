@@ -340,7 +340,7 @@ def test_unknown_scenes_are_refused():
     assert acted.shape == (3,)
     with pytest.raises(UserError, match='scene 3'):
         policy.act(observation, env.goals, info['reset'], np.array([0, 3, 1]))
-    with pytest.raises(UserError, match='is told the scene'):
+    with pytest.raises(UserError, match='needs the scene'):
         policy.act(observation, env.goals, info['reset'])
     known = ['house:7', 'house:8']
     assert scene_numbers(['house:8', 'house:7', 'house:8'], known).tolist() == [1, 0, 1]

@@ -15,14 +15,16 @@ import numpy as np
 
 from vn_msgs_py.motion import MotionError, odometry_to_array
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.drive import JUMP, JUMP_SPEED
-from vn_nav.bags.stamped import WAIT, set_back
+from vn_nav.bags.drive import ODOMETRY_JUMP_M, ODOMETRY_JUMP_M_PER_S
+from vn_nav.bags.stamped import PAIRING_TIMEOUT_S, set_back
 from vn_nav.bags.storage.stream import messages
 
-# Beside JUMP and JUMP_SPEED: faster turns than any robot's, and what a correction may do at once.
+# Like ODOMETRY_JUMP_M and ODOMETRY_JUMP_M_PER_S, for turns: the largest correction at once, and
+# more than the turn rate of any robot.
 TURN_JUMP, TURN_SPEED = math.radians(45), 2 * math.pi  # rad, rad/s
-SILENCE = 10.0  # s without odometry: the robot may have been carried, or its odometry restarted,
-STOOD = (0.05, math.radians(3))  # m, rad: unless it stands where it stood
+# After so long without odometry the robot may have been carried, or its odometry restarted, ...
+ODOMETRY_GAP_S = 10.0
+STANDSTILL_M_RAD = (0.05, math.radians(3))  # m, rad: ... unless its pose is the same
 
 
 class Break(NamedTuple):
@@ -71,7 +73,7 @@ def divide(stamps: np.ndarray, breaks: list[Break], odometry: bool = True) -> St
         odometry: whether there is any; commands alone do not tell what happened in a silence.
     """
     ends = np.cumsum([0, *(b.back for b in breaks)])[1:]  # run of the clock that each break is in
-    run = np.append(0, np.cumsum(np.diff(stamps) <= -WAIT))
+    run = np.append(0, np.cumsum(np.diff(stamps) <= -PAIRING_TIMEOUT_S))
     number, sound = np.zeros(len(stamps), np.int64), np.ones(len(stamps), bool)
     reasons = {0: ''}
     for k, cut in enumerate(breaks):
@@ -85,7 +87,7 @@ def divide(stamps: np.ndarray, breaks: list[Break], odometry: bool = True) -> St
         number += begins
         reasons[k + 1] = cut.reason
     for k in np.flatnonzero(np.diff(run) if odometry else
-                            (np.diff(run) != 0) | (np.diff(stamps) > SILENCE)).tolist():
+                            (np.diff(run) != 0) | (np.diff(stamps) > ODOMETRY_GAP_S)).tolist():
         if number[k] == number[k + 1]:
             reasons = {n + (n > number[k]): why for n, why in reasons.items()}
             reasons[number[k] + 1] = ('the stamps of pictures go back' if run[k] != run[k + 1] else
@@ -102,12 +104,12 @@ def _reason(last: np.ndarray, now: np.ndarray, frame: str, name: str) -> str:
     seconds = now[3] - last[3]
     moved = math.hypot(*(now[:2] - last[:2]))
     turned = abs(wrap_angle(now[2] - last[2]))
-    if -seconds >= WAIT:
+    if -seconds >= PAIRING_TIMEOUT_S:
         return f'the clock of odometry goes back by {-seconds:.1f} s'
-    if moved > JUMP + JUMP_SPEED * seconds:
+    if moved > ODOMETRY_JUMP_M + ODOMETRY_JUMP_M_PER_S * seconds:
         return f'odometry jumps by {moved:.1f} m in {seconds:.2f} s'
     if turned > TURN_JUMP + TURN_SPEED * seconds:
         return f'odometry turns by {math.degrees(turned):.0f} deg in {seconds:.2f} s'
-    if seconds > SILENCE and (moved > STOOD[0] or turned > STOOD[1]):
+    if seconds > ODOMETRY_GAP_S and (moved > STANDSTILL_M_RAD[0] or turned > STANDSTILL_M_RAD[1]):
         return f'odometry is silent for {seconds:.0f} s and then {moved:.1f} m away'
     return ''

@@ -19,7 +19,16 @@ import numpy as np
 
 from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
-from vn_nav.bags.drive import MISFIT, Cutter, Frame, Report, Step, find_topics, hear, synchronise
+from vn_nav.bags.drive import (
+    NO_ACTION,
+    ActionSegmenter,
+    Frame,
+    Report,
+    Step,
+    find_topics,
+    hear,
+    synchronise,
+)
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.storage.bag_files import files_of
 from vn_nav.bags.storage.stream import messages, summary
@@ -30,7 +39,8 @@ from vn_nav.robot import RobotSpec
 FORMAT = 2  # of the files; another one is decoded anew
 INDEX = 'index.json'
 MAX_DEPTH = 10.0  # m, stored as 255; 0: unknown
-IN_FLIGHT = 64  # pictures on their way through the decoders: memory is bounded by this
+# Pictures in the decoders at once: bounds the memory.
+MAX_PICTURES_IN_FLIGHT = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +76,7 @@ class DriveSet:
     image: Pictures  # [N,3,S,S] uint8
     pose: np.ndarray  # [N,3] float64 x, y [m], yaw [rad] in the frame of the odometry
     time: np.ndarray  # [N] float64 s, stamps
-    action: np.ndarray  # [N] int16, that begins here; `drive.MISFIT`: none, or the end
+    action: np.ndarray  # [N] int16, that begins here; `drive.NO_ACTION`: none, or the end
     episode: np.ndarray  # [N] int64
     goal: np.ndarray  # [N] int64 into goals, -1: no goal was shown
     goals: np.ndarray  # [G,3,S,S] uint8
@@ -93,7 +103,7 @@ def load_drives(bag: str | Path, wanted: Wanted, cache: str | Path,
         wanted: what to make of it.
         cache: folder of decoded bags. An entry is made whole or not at all, and belongs to the
             files as they are now: a bag that changes is decoded anew.
-        show: is told the share of the pictures that is decoded.
+        show: receives the share of the pictures that is decoded.
 
     Raises:
         UserError: no readable bag, topics that it lacks, a camera narrower than the robot's, no
@@ -123,15 +133,15 @@ def decoded(steps: Iterable[Step], wanted: Wanted, fov: float | None
             ) -> Iterator[tuple[Step, dict[str, np.ndarray] | None]]:
     """Steps with their pictures, in order; None where a picture cannot be decoded.
 
-    Decoding and scaling run in `wanted.threads` threads beside the reading: OpenCV lets go of the
-    interpreter meanwhile. At most `IN_FLIGHT` steps are held.
+    Decoding and scaling run in `wanted.threads` threads beside the reading: OpenCV releases the
+    interpreter meanwhile. At most `MAX_PICTURES_IN_FLIGHT` steps are held.
     """
     pool = concurrent.futures.ThreadPoolExecutor(wanted.threads)
     flying: collections.deque = collections.deque()
     try:
         for step in steps:
             flying.append((step, pool.submit(_pictures, step.frame, wanted, fov)))
-            if len(flying) >= IN_FLIGHT:
+            if len(flying) >= MAX_PICTURES_IN_FLIGHT:
                 step, future = flying.popleft()
                 yield step, future.result()
         while flying:
@@ -153,13 +163,13 @@ def read_steps(bag: str | Path, wanted: Wanted, report: Report) -> tuple[Iterato
     if fov is not None:
         crop_fraction(fov, wanted.robot.camera_fov)  # or says that the camera is too narrow
     frames = synchronise(hear(bag, topics), topics, report)
-    steps = (_each(frames) if wanted.every else Cutter(wanted.robot, report).cut(frames))
+    steps = (_each(frames) if wanted.every else ActionSegmenter(wanted.robot, report).cut(frames))
     return steps, {'topics': dataclasses.asdict(topics), 'fov': fov}
 
 
 def _each(frames) -> Iterator[Step]:
     for frame in frames:
-        yield Step(frame, MISFIT, False)
+        yield Step(frame, NO_ACTION, False)
 
 
 def _pictures(frame, wanted: Wanted, fov: float | None) -> dict[str, np.ndarray] | None:
@@ -235,7 +245,7 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
         if pictures is None:
             bad += 1
             if rows and rows[-1][2] == frame.episode:
-                rows[-1][1] = MISFIT  # where that action led to was not seen
+                rows[-1][1] = NO_ACTION  # where that action led to was not seen
             continue
         if frame.goal is not shown_goal:
             shown_goal = frame.goal
@@ -249,7 +259,7 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
             columns.append(name, pictures.get(name, missing).astype(np.uint8))
         columns.append('beside', np.array(['depth' in pictures, 'labels' in pictures]))
     if not rows:
-        raise UserError('a bag to learn from holds pictures with poses beside them',
+        raise UserError('a bag for learning holds pictures with matching poses',
                         f'{bag}: {report.pictures} pictures, {report.without_pose} without a '
                         f'pose, {bad} that cannot be decoded', 'see `vn_nav bag doctor`')
     np.save(folder / 'rows.npy', np.array(rows, np.float64))

@@ -4,8 +4,8 @@ Any bag will do: pictures raw or compressed, odometry or only the velocity that 
 any rate, driven by a policy or by hand. Two stages, both streaming:
 
 `synchronise` gives every camera picture the pose, depth and labels that belong to it, by header
-stamps, and tells episodes apart. `Cutter` finds, along the poses, the pictures between which the
-robot did just one of its discrete actions; what fits no action is kept, and counted.
+stamps, and separates episodes. `ActionSegmenter` finds, along the poses, the pictures between
+which the robot did just one of its discrete actions; what fits no action is kept, and counted.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ import numpy as np
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.roles import Topics
-from vn_nav.bags.stamped import GAP, WAIT, Stamped, set_back
+from vn_nav.bags.stamped import EPISODE_GAP_S, PAIRING_TIMEOUT_S, Stamped, set_back
 from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.robot import RobotSpec
 
-COMMAND_LASTS = 0.5  # s that a velocity is believed without a new one, as bases do
-JUMP_SPEED = 5.0  # m/s: faster, somebody has put the robot (or its odometry) elsewhere
-JUMP = 0.3  # m that odometry may be corrected by between two pictures
-MISFIT = -1  # in place of an action
-MIXED = 0.5  # share of an action that a motion may do along another axis beside it
-COARSE = 0.35  # share of an action that may be missing or too much at its end
+COMMAND_TIMEOUT_S = 0.5  # a velocity is valid for this long without a new one, as in bases
+ODOMETRY_JUMP_M_PER_S = 5.0  # faster: the robot was carried, or its odometry was reset
+ODOMETRY_JUMP_M = 0.3  # m that odometry may be corrected by between two pictures
+NO_ACTION = -1  # in place of an action
+MAX_OFF_AXIS_SHARE = 0.5  # share of an action that a motion may have along another axis
+ACTION_LENGTH_TOLERANCE = 0.35  # share of an action that may be missing or too much at its end
 RECORDED = 'recorded'  # world version of pictures from no simulator, or from several
 
 
@@ -87,7 +87,7 @@ class Report:
     """What a bag held and what of it did not fit."""
 
     pictures: int = 0
-    without_pose: int = 0  # no odometry within `WINDOW`
+    without_pose: int = 0  # no odometry within `STAMP_WINDOW_S`
     unordered: int = 0  # late and repeated stamps
     set_back: int = 0  # of the clock of the pictures: a new episode begins
     bad: int = 0  # velocities and poses that are none
@@ -107,10 +107,12 @@ def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: 
     """Camera pictures with their poses, in order, one episode after the other.
 
     Poses are interpolated between the odometry before and after a picture, if the nearer of the
-    two lies within `WINDOW`; without odometry, commanded velocities are integrated. An episode
-    ends with a message on `episode_end`, with a new goal, with `GAP` seconds without a picture,
+    two lies within `STAMP_WINDOW_S`; without odometry, commanded velocities are integrated. An
+    episode
+    ends with a message on `episode_end`, with a new goal, with `EPISODE_GAP_S` seconds without a
+    picture,
     where the pose jumps and where the clock of the pictures was set back, see `set_back`. What is
-    held at a time is bounded by `WAIT` seconds of recording.
+    held at a time is bounded by `PAIRING_TIMEOUT_S` seconds of recording.
 
     Args:
         messages: in the order of recording.
@@ -151,7 +153,7 @@ def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: 
             goal, goal_stamp = message, stamp
         while waiting and (track.knows(waiting[0][0]) and all(
                 rows.reaches(waiting[0][0]) for rows in beside.values())
-                or waiting[0][1] < time - WAIT):
+                or waiting[0][1] < time - PAIRING_TIMEOUT_S):
             last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
     while waiting:
         last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
@@ -172,11 +174,11 @@ def _settle(picture, track, beside, topics: Topics, last: Frame | None, report: 
         ('depth', topics.depth), ('labels', topics.labels)) if name}
     number = 0
     if last is not None:
-        # Episodes are numbered anew, because gaps and jumps begin some that nobody announced.
+        # Episodes are renumbered, because gaps and jumps begin episodes without a message.
         announced = episode != last.announced
-        gap = stamp - last.stamp > GAP or time - last.time > GAP
+        gap = stamp - last.stamp > EPISODE_GAP_S or time - last.time > EPISODE_GAP_S
         moved = math.hypot(*(pose[:2] - last.pose[:2]))
-        jumped = moved > JUMP + JUMP_SPEED * max(stamp - last.stamp, 0.0)
+        jumped = moved > ODOMETRY_JUMP_M + ODOMETRY_JUMP_M_PER_S * max(stamp - last.stamp, 0.0)
         report.set_back += back
         report.jumps += jumped and not announced and not back
         number = last.episode + (announced or gap or jumped or back)
@@ -218,7 +220,7 @@ class _DeadReckoning:
     def __init__(self):
         self._pose = np.zeros(3)
         self._velocity = np.zeros(3)
-        self._from = -math.inf  # when the velocity was heard
+        self._from = -math.inf  # when the velocity was received
         self._at: float | None = None  # time of the pose
         self._past: collections.deque[tuple[float, np.ndarray]] = collections.deque()
 
@@ -238,7 +240,7 @@ class _DeadReckoning:
         if self._at is not None and set_back(time, self._at):  # another take
             self._velocity, self._from, self._at = np.zeros(3), -math.inf, time
         if self._at is not None and time > self._at:
-            lasts = min(time, self._from + COMMAND_LASTS) - self._at
+            lasts = min(time, self._from + COMMAND_TIMEOUT_S) - self._at
             if lasts > 0:
                 self._pose = integrate(self._pose, self._velocity, lasts)
         self._at = time if self._at is None else max(self._at, time)
@@ -266,15 +268,16 @@ class Step(NamedTuple):
     """A frame at which an action begins, and the action; an episode's last frame has none."""
 
     frame: Frame
-    action: int  # index; `MISFIT`: what followed was none of the robot's actions
+    action: int  # index; `NO_ACTION`: what followed was none of the robot's actions
     last: bool  # of its episode: no action follows
 
 
-class Cutter:
+class ActionSegmenter:
     """Cuts frames into the actions of a robot.
 
     From a frame on, the robot moves along the axes of its actions. A later frame ends an action
-    if the motion until there is that action to `COARSE`, and less than `MIXED` of one along every
+    if the motion until there is that action to `ACTION_LENGTH_TOLERANCE`, and less than
+    `MAX_OFF_AXIS_SHARE` of one along every
     other axis; of those that do, the one where it fits best, which shows when the robot has moved
     on from there. A drive by hand is cut where its curves allow.
 
@@ -290,7 +293,7 @@ class Cutter:
     def __init__(self, robot: RobotSpec, report: Report):
         self._moves = np.array(robot.moves)
         self._driving = np.abs(self._moves).sum(1) > 0
-        # The largest action of each axis is what motion beside an action is measured by.
+        # The largest action of each axis is the unit of off-axis motion.
         length = np.abs(self._moves[:, :2]).max() or 0.5
         turn = np.abs(self._moves[:, 2]).max() or math.radians(30)
         self._unit = np.array([length, length, turn])
@@ -327,7 +330,7 @@ class Cutter:
             if self._cost(moved).min() > self._best[0] + self.MOVED_ON:
                 yield from self._finish()
         elif (np.abs(moved) > self.TOO_FAR * self._unit).any():
-            yield self._step(MISFIT, frame)
+            yield self._step(NO_ACTION, frame)
 
     def _finish(self) -> Iterator[Step]:
         """End the action where it fitted best, and go on from there."""
@@ -341,7 +344,7 @@ class Cutter:
     def _step(self, action: int, end: Frame) -> Step:
         assert self._begin is not None  # an action ends that began there
         step = Step(self._begin, action, False)
-        if action == MISFIT:
+        if action == NO_ACTION:
             self._report.misfits += 1
         else:
             self._report.actions[action] += 1
@@ -354,21 +357,21 @@ class Cutter:
         if self._begin is not None and self._last is not None:
             # What is left over is a motion of its own, unless it is next to none.
             moved = np.abs(_relative(self._begin.pose, self._last.pose)) / self._unit
-            if moved.max() >= MIXED:
-                yield self._step(MISFIT, self._last)
-            yield Step(self._begin, MISFIT, True)
+            if moved.max() >= MAX_OFF_AXIS_SHARE:
+                yield self._step(NO_ACTION, self._last)
+            yield Step(self._begin, NO_ACTION, True)
         self._begin = self._last = None
 
     def _fit(self, moved: np.ndarray) -> tuple[int, float]:
         """The action that a motion [3] is, and by how much it is not; infinity: it is none."""
-        share, beside = self._shares(moved), self._beside(moved)
-        cost = np.where((np.abs(share - 1) <= COARSE) & (beside < MIXED), self._cost(moved),
-                        np.inf)
+        share, off_axis = self._shares(moved), self._off_axis(moved)
+        fits = (np.abs(share - 1) <= ACTION_LENGTH_TOLERANCE) & (off_axis < MAX_OFF_AXIS_SHARE)
+        cost = np.where(fits, self._cost(moved), np.inf)
         action = int(np.argmin(cost))
         return action, float(cost[action])
 
     def _cost(self, moved: np.ndarray) -> np.ndarray:
-        cost = np.abs(self._shares(moved) - 1) + 0.5 * self._beside(moved)
+        cost = np.abs(self._shares(moved) - 1) + 0.5 * self._off_axis(moved)
         return np.where(self._driving, cost, np.inf)
 
     def _shares(self, moved: np.ndarray) -> np.ndarray:
@@ -376,7 +379,7 @@ class Cutter:
         along = (self._moves * moved).sum(1)
         return along / np.maximum((self._moves**2).sum(1), 1e-12)
 
-    def _beside(self, moved: np.ndarray) -> np.ndarray:
+    def _off_axis(self, moved: np.ndarray) -> np.ndarray:
         """The largest share of an action that a motion does along other axes than each's, [A]."""
         return np.where(self._moves == 0, np.abs(moved) / self._unit, 0.0).max(axis=1)
 

@@ -66,7 +66,7 @@ class Topics:
         if not found['image'] or not (found['odometry'] or found['command']):
             role = 'image' if not found['image'] else 'odometry or command'
             first = role.split()[0]
-            raise UserError(f'a bag to learn from holds the topic {getattr(self, first)} ({role})',
+            raise UserError(f'a bag for learning holds the topic {getattr(self, first)} ({role})',
                             sorted(there), remedy(first, free))
         return Topics(**found)
 
@@ -143,6 +143,6 @@ def remedy(role: str, recorded: Mapping[str, str], stand_in: bool = False) -> st
         return proposed or (f'name the topic of the bag in a YAML file ({role}: /its/name) and '
                             'give it with --topics, or record it')
     leave = f'`{role}: null` to ' + ('leave it out' if role != 'odometry' else (
-        'have the commands stand in, which drift (teach needs odometry)'))
+        'have the poses are integrated from commands and drift (teach needs odometry)'))
     return f'{proposed}, or {leave}' if proposed else (
         f'in a YAML file that you give with --topics, write {leave}')

@@ -6,11 +6,11 @@ import bisect
 import collections
 from typing import Any, NamedTuple
 
-WINDOW = 0.05  # s between the stamps of a picture and of what belongs to it
-WAIT = 1.0  # s of recording time that a picture waits for what belongs to it
-GAP = 1.0  # s without a picture end an episode
-KEPT = 2 * WAIT  # s of stamps that are remembered
-FORGOTTEN = 3 * WAIT  # s of recording time after which a run is over
+STAMP_WINDOW_S = 0.05  # s between the stamps of a picture and of what belongs to it
+PAIRING_TIMEOUT_S = 1.0  # s of recording time that a picture waits for what belongs to it
+EPISODE_GAP_S = 1.0  # s without a picture end an episode
+STAMP_HISTORY_S = 2 * PAIRING_TIMEOUT_S  # s of stamps that are remembered
+RUN_EXPIRY_S = 3 * PAIRING_TIMEOUT_S  # s of recording time after which a run is over
 
 
 def set_back(stamp: float, last: float) -> bool:
@@ -22,7 +22,7 @@ def set_back(stamp: float, last: float) -> bool:
         stamp: s.
         last: the newest one before [s].
     """
-    return stamp <= last - WAIT
+    return stamp <= last - PAIRING_TIMEOUT_S
 
 
 class Entry(NamedTuple):
@@ -34,7 +34,7 @@ class Entry(NamedTuple):
 
 
 class _Run:
-    """Messages whose stamps go on, without gaps above `GAP`."""
+    """Messages whose stamps go on, without gaps above `EPISODE_GAP_S`."""
 
     def __init__(self):
         self.stamps: collections.deque[float] = collections.deque()
@@ -43,7 +43,7 @@ class _Run:
     def add(self, entry: Entry) -> None:
         self.stamps.append(entry.stamp)
         self.entries.append(entry)
-        while self.stamps[-1] - self.stamps[0] > KEPT:
+        while self.stamps[-1] - self.stamps[0] > STAMP_HISTORY_S:
             self.drop()
 
     def drop(self) -> None:
@@ -70,14 +70,14 @@ class Stamped:
     def hear(self, stamp: float, time: float, value: Any) -> None:
         """Take a message in the order of recording; late and repeated ones are left out."""
         self._runs = [run for run in self._runs[:-1] if abs(
-            time - run.entries[-1].time) <= FORGOTTEN] + self._runs[-1:]
+            time - run.entries[-1].time) <= RUN_EXPIRY_S] + self._runs[-1:]
         if self._runs:
             last = self._runs[-1].stamps[-1]
             if stamp <= last and not set_back(stamp, last):
                 return
         # After one stray stamp the run before it goes on.
         for k in reversed(range(len(self._runs))):
-            if 0 < stamp - self._runs[k].stamps[-1] <= GAP:
+            if 0 < stamp - self._runs[k].stamps[-1] <= EPISODE_GAP_S:
                 self._runs.append(self._runs.pop(k))
                 break
         else:
@@ -86,10 +86,10 @@ class Stamped:
 
     def reaches(self, stamp: float) -> bool:
         """Whether nothing nearer to a stamp can come any more."""
-        return any(run.stamps[0] - WINDOW <= stamp <= run.stamps[-1] for run in self._runs)
+        return any(run.stamps[0] - STAMP_WINDOW_S <= stamp <= run.stamps[-1] for run in self._runs)
 
     def around(self, stamp: float, time: float) -> tuple[Entry, Entry] | None:
-        """The messages before and after a stamp; None: the nearer is not within `WINDOW`.
+        """The messages before and after a stamp; None: the nearer is not within `STAMP_WINDOW_S`.
 
         Args:
             stamp: of a picture [s].
@@ -99,7 +99,7 @@ class Stamped:
         return None if found is None else found[1]
 
     def nearest(self, stamp: float, time: float) -> Any:
-        """The message nearest to a stamp, within `WINDOW`, or None; older ones are forgotten."""
+        """The message nearest to a stamp, within `STAMP_WINDOW_S`, or None; drops older ones."""
         found = self._near(stamp, time)
         if found is None:
             return None
@@ -111,5 +111,5 @@ class Stamped:
     def _near(self, stamp: float, time: float) -> tuple[_Run, tuple[Entry, Entry]] | None:
         pairs = [(run, run.around(stamp)) for run in self._runs]
         near = [(run, pair) for run, pair in pairs
-                if min(abs(entry.stamp - stamp) for entry in pair) <= WINDOW]
+                if min(abs(entry.stamp - stamp) for entry in pair) <= STAMP_WINDOW_S]
         return min(near, key=lambda found: abs(found[1][0].time - time), default=None)

@@ -20,7 +20,7 @@ ARRIVAL, DECLARED = 'arrival', 'declared'  # what ends an episode before its lim
 OTHER, WRONG, BLANK, RANDOM, SHORTEST = (
     'other decoding', 'wrong goal', 'blank goal', 'random actions', 'shortest path')
 CONTROLS = (OTHER, WRONG, BLANK, RANDOM, SHORTEST)
-STOP_THRESHOLD = 0.5  # of the arrival head's probability, where nobody chose another
+STOP_THRESHOLD = 0.5  # of the arrival head's probability, by default
 SCENES_AT_ONCE = 16  # in memory
 ENVIRONMENTS = 50  # at most at once, unless there are more scenes
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from vn_nav.arrival import arrived, heading_error
 from vn_nav.bags.dataset import MAX_DEPTH
-from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.drive import NO_ACTION
 from vn_nav.co_visibility import co_visible, co_visible_by_poses, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
@@ -166,7 +166,8 @@ def split(drives: Drives, share: float, seed: int) -> Split:
     Raises:
         UserError: too few steps for both.
     """
-    acting = [bool((drives.action[first:stop] != MISFIT).any()) for first, stop in drives.episodes]
+    acting = [bool((drives.action[first:stop] != NO_ACTION).any())
+              for first, stop in drives.episodes]
     parts = [_split([span for span, acts in zip(drives.episodes, acting, strict=True)
                      if acts == kind], share, seed) for kind in (True, False) if kind in acting]
     return Split([span for part in parts for span in part.train],
@@ -232,7 +233,7 @@ def draw_windows(drives: Drives, spans: Sequence[Span], length: int, farthest: i
     """
     found = []
     for first, stop in spans:
-        if (drives.action[first:stop] == MISFIT).all():
+        if (drives.action[first:stop] == NO_ACTION).all():
             continue
         begin, end = first, first + 1 + int(rng.integers(length))
         while begin < stop - 1:
@@ -255,8 +256,8 @@ def fill_windows(drives: Drives, windows: np.ndarray, length: int) -> Windows:
     rows = np.minimum(begin + time, stop - 1)
     valid = begin + time < stop
     action = drives.action[rows]
-    acts = valid & (action != MISFIT) & (rows < goal)
-    before = np.concatenate([np.full((1, len(begin)), MISFIT), action[:-1]])
-    starts = before == MISFIT
-    return Windows(rows, goal, valid, acts, np.where(action == MISFIT, 0, action), starts,
+    acts = valid & (action != NO_ACTION) & (rows < goal)
+    before = np.concatenate([np.full((1, len(begin)), NO_ACTION), action[:-1]])
+    starts = before == NO_ACTION
+    return Windows(rows, goal, valid, acts, np.where(action == NO_ACTION, 0, action), starts,
                    np.where(starts, -1, before))

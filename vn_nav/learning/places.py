@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import softened
 from vn_nav.policy.network import Policy
-from vn_nav.policy.places import PlaceClassifier, Routes, heading_cells
+from vn_nav.policy.places import PathAdvice, PlaceClassifier, heading_cells
 
 BATCH = 128  # pictures
 LEARNING_RATE = 1e-3  # of Adam, at the start; falls to a twentieth
@@ -97,7 +97,7 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
 def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets: np.ndarray, *,
                until: float, say: Callable[[str], None], seed: int = 0, least: int = 1,
                show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
-    """Teach `Routes` the shortest ways, by what the classifier says of pictures.
+    """Teach `PathAdvice` the shortest ways, by what the classifier says of pictures.
 
     Cross-entropy with `softened` choices. Each picture is recognised once, and a hundred thousand
     ways a second are learned from.
@@ -144,7 +144,7 @@ def _places(network: Policy) -> PlaceClassifier:
     return network.places
 
 
-def _routes(network: Policy) -> Routes:
+def _routes(network: Policy) -> PathAdvice:
     assert network.routes is not None  # the network was made for a place
     return network.routes
 

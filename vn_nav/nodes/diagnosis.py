@@ -80,9 +80,9 @@ class Diagnosis:
         for info in self.node.get_subscriptions_info_by_topic(self.command.topic_name):
             if info.topic_type != mine:
                 other = mine == 'geometry_msgs/msg/Twist'
-                return (f'{info.node_name} listens for {info.topic_type} where this node sends '
+                return (f'{info.node_name} subscribes to {info.topic_type} where this node sends '
                         f'{mine}: set enable_stamped_cmd_vel to {str(other).lower()}')
             if info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
-                return (f'{info.node_name} asks for transient local commands, which nobody keeps: '
-                        'set its durability to volatile')
+                return (f'{info.node_name} requests transient local commands, which are not '
+                        'latched here: set its durability to volatile')
         return ''

@@ -129,9 +129,10 @@ class PolicyInputs:
     # What there is to say of them.
 
     def unheard(self) -> list[str]:
-        """Topics that are published and not heard: another type, or odometry that never comes."""
-        found = [f'{node} publishes {name} as {other}, and this node listens for {kind.__name__}: '
-                 'remap it, or republish it' for name, kind in self._types.items()
+        """Topics that are published and not received: another type, or no odometry."""
+        found = [f'{node} publishes {name} as {other}, and this node subscribes to '
+                 f'{kind.__name__}: remap it, or republish it'
+                 for name, kind in self._types.items()
                  for node, other in other_types(self._node, name, kind)]
         if self._output.odometry is None and not found and (
                 self._node.count_publishers(self.odometry_topic)):

@@ -11,8 +11,8 @@ from vn_nav.nodes import parameters
 PARAMETERS = {
     'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),
     'robot': ('', 'YAML file of the robot; empty: the standard robot', None),
-    'mode': ('stop_and_go', 'stop_and_go; continuous: a decision at every frame; shadow: beside '
-                            'somebody else who drives, see docs/architecture.md',
+    'mode': ('stop_and_go', 'stop_and_go; continuous: a decision at every frame; shadow: another '
+                            'driver has control, see docs/architecture.md',
              ('stop_and_go', 'continuous', 'shadow')),
     'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step',
              ('real_time', 'lock_step')),
@@ -26,15 +26,17 @@ PARAMETERS = {
     'stop_threshold': (-1.0, 'probability of arrival above which the robot stands still and says '
                              'so, 0 to 1 (1: never); -1: as the checkpoint says', (-1.0, 1.0)),
     'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
-    'frame_timeout': (0.25, 'camera silence after which the robot stands still [s]', (0.05, 5.0)),
-    'frame_stop_timeout': (1.0, 'camera silence that latches a stop [s]', (0.1, 10.0)),
+    'frame_timeout': (0.25, 'time without pictures after which the robot stands still [s]',
+                      (0.05, 5.0)),
+    'frame_stop_timeout': (1.0, 'time without pictures after which a stop latches [s]',
+                           (0.1, 10.0)),
     'max_frame_age': (0.25, 'older frames are dropped [s]', (0.02, 5.0)),
     'max_frame_ahead': (0.05, 'frames stamped later than now are dropped [s]', (0.0, 5.0)),
     'inference_timeout': (0.1, 'later decisions are discarded [s]', (0.005, 2.0)),
-    'odometry_timeout': (0.5, 'odometry silence after which the robot stands still, and in motion '
-                              'stops [s]', (0.05, 5.0)),
-    'require_odometry': (False, 'enable motion only where odometry has come: without it actions '
-                                'run on time alone', None),
+    'odometry_timeout': (0.5, 'time without odometry after which the robot stands still; in '
+                              'motion it latches a stop [s]', (0.05, 5.0)),
+    'require_odometry': (False, 'enable motion only with odometry: without it actions run on '
+                                'time alone', None),
     'settle_time': (0.1, "from a motion's last command to a frame at rest [s]", (0.0, 2.0)),
 }
 

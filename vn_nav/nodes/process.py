@@ -140,7 +140,7 @@ def _refusals() -> Iterator[None]:
         said = ' '.join(re.sub(r', at /\S+:\d+', '', str(error)).split())
         said = said.removeprefix('Failed to parse ROS arguments: ')
         remedy = next((remedy for word, remedy in REMEDIES.items() if word in said), 'see --help')
-        raise UserError('arguments are as ROS wants them', said, remedy) from error
+        raise UserError('arguments follow the ROS syntax', said, remedy) from error
 
 
 @contextlib.contextmanager

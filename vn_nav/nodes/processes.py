@@ -54,7 +54,7 @@ class Processes:
         code = self.running[name].poll()
         if code not in (None, 0):
             lines = self.log(name).strip().splitlines() or ['nothing']
-            raise ProcessFailure(f'{name} ended with code {code}; its last words: {lines[-1]}')
+            raise ProcessFailure(f'{name} ended with code {code}; its last line: {lines[-1]}')
 
     def stop(self, name: str) -> None:
         """SIGINT, and SIGKILL after 10 s, to the child and whatever it started."""

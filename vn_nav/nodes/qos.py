@@ -34,7 +34,7 @@ def profile(entry: Topic, *, depth: int | None = None) -> QoSProfile:
 
 
 def subscribe(node, kind: type, name: str, callback: Callable[[Any], None]) -> list[Subscription]:
-    """Subscribe so that any publisher of a topic is heard, whatever its quality of service.
+    """Subscribe with a QoS that is compatible with every publisher of the topic.
 
     A sensor is asked for with best effort, which every publisher offers. A latched topic needs
     one subscription for each kind of publisher: what was said before (reliable and transient

@@ -49,7 +49,7 @@ class RecordedTopics:
         def callback(message, info) -> None:
             nonlocal last
             this = (info['source_timestamp'], info.get('publication_sequence_number'))
-            if anybody and this == last:  # heard by another subscription of the topic
+            if anybody and this == last:  # received by another subscription of the topic
                 return
             last = this
             record(message, info)

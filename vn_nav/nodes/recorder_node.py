@@ -21,17 +21,17 @@ from rclpy.subscription import Subscription
 from vn_msgs_py.topics import BEST_EFFORT, LATCHED, TOPICS, VOLATILE, Topic, topic
 from vn_nav.bags.storage.definitions import definition
 from vn_nav.bags.storage.losses import Losses
-from vn_nav.bags.storage.writer import MIN_FREE, BagWriter, RecordingStopped
+from vn_nav.bags.storage.writer import MIN_FREE_BYTES, BagWriter, RecordingStopped
 from vn_nav.errors import UserError
 from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import profile, qos
 
-QUEUE = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
-ROUND = 16  # messages of a topic that are taken before its neighbours have their turn
-POLL = 0.005  # s between looks at the subscriptions when there was nothing
-LOOK = 0.2  # s between looks at who publishes
-REPORT = 1.0  # s
+QUEUE_DEPTH = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
+MESSAGES_PER_TURN = 16  # messages of a topic that are taken before its neighbours have their turn
+POLL_PERIOD_S = 0.005  # s between looks at the subscriptions when there was nothing
+GRAPH_PERIOD_S = 0.2  # s between looks at who publishes
+REPORT_PERIOD_S = 1.0  # s
 TWIN = {'geometry_msgs/msg/Twist': 'geometry_msgs/msg/TwistStamped'}  # accepted in its place
 COMPRESSED = 'image_raw/compressed'  # a bag needs a picture once: only where there is no raw one
 
@@ -47,12 +47,13 @@ PARAMETERS = {
     'topics': ([entry.name for entry in TOPICS
                 if _installed(entry.type) and entry.name != COMPRESSED],
                'topics to record: names of the contract, or name:type; left as it is: also '
-               f'{COMPRESSED} where nobody publishes raw pictures'),
-    'all': (False, 'record whatever is published as well'),
+               f'{COMPRESSED} where no raw pictures are published'),
+    'all': (False, 'record all other published topics as well'),
     'max_bag_size': (0, 'bytes of a file before the next is begun; 0: no limit', (0, 1 << 50)),
     'max_bag_duration': (0.0, 'seconds of a file before the next is begun; 0: no limit',
                          (0.0, 1e9)),
-    'min_free_space': (MIN_FREE, 'bytes of the disk that stay free: below that, recording stops',
+    'min_free_space': (MIN_FREE_BYTES,
+                       'bytes of the disk that stay free: below that, recording stops',
                        (0, 1 << 50)),
 }
 
@@ -102,7 +103,7 @@ class RecorderNode(Node):
         for entry in entries:
             self._listen(entry)
         self.get_logger().info(f'recording {len(entries)} topics'
-                               f'{" and whatever is published" if self.everything else ""} '
+                               f'{" and all other published topics" if self.everything else ""} '
                                f'into {output}')
 
     def drain(self) -> bool:
@@ -115,7 +116,7 @@ class RecorderNode(Node):
         for tap in self.taps.values():
             handle = tap.subscription.handle
             with handle:
-                for _ in range(ROUND):
+                for _ in range(MESSAGES_PER_TURN):
                     if (taken := handle.take_message(tap.message, True)) is None:
                         break
                     heard.append((self._note(tap, taken[1]), tap, taken))
@@ -133,10 +134,10 @@ class RecorderNode(Node):
         """Look for publishers, and say what was lost, each when it is due."""
         now = time.monotonic()
         if now >= self.look_at and not self.stopped:
-            self.look_at = now + LOOK
+            self.look_at = now + GRAPH_PERIOD_S
             self._look()
         if now >= self.report_at:
-            self.report_at = now + REPORT
+            self.report_at = now + REPORT_PERIOD_S
             self._report()
 
     def destroy_node(self) -> None:
@@ -178,7 +179,7 @@ class RecorderNode(Node):
         message = _message(entry.type)
         subscription = self.create_subscription(
             message, entry.name, lambda _: None,
-            profile(entry, depth=max(QUEUE, entry.depth)), raw=True)
+            profile(entry, depth=max(QUEUE_DEPTH, entry.depth)), raw=True)
         name = self.resolve_topic_name(entry.name)
         before = self.taps.get(name)
         self.taps[name] = Tap(entry, name, message, subscription)
@@ -329,7 +330,7 @@ def record(node: RecorderNode, ended: Ended) -> None:
         busy = not node.stopped and node.drain()
         node.tend()
         if not busy:
-            time.sleep(POLL)
+            time.sleep(POLL_PERIOD_S)
     last = time.monotonic() + 1.0  # s for what has arrived by now
     while not node.stopped and node.drain() and time.monotonic() < last:
         pass

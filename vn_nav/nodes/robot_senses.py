@@ -1,4 +1,4 @@
-"""What a robot behind topics sees and is told: pictures, goals, rewards, the ends of episodes."""
+"""What a robot behind topics receives: pictures, goals, rewards, the ends of episodes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from std_msgs.msg import Bool, Float32, String, UInt8
 
 from vn_msgs_py import images
 from vn_msgs_py.camera import field_of_view
-from vn_nav.bags.stamped import WINDOW
+from vn_nav.bags.stamped import STAMP_WINDOW_S
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.recorded_topics import RecordedTopics
 from vn_nav.observation import needed_side, preprocess, preprocess_map
@@ -226,6 +226,6 @@ def _seconds(stamp) -> float:
 
 
 def _nearest(rows: collections.deque, stamp: float) -> Any:
-    """The message nearest to a stamp, within `WINDOW`; None: there is none."""
+    """The message nearest to a stamp, within `STAMP_WINDOW_S`; None: there is none."""
     near = min(rows, key=lambda row: abs(row[0] - stamp), default=None)
-    return near[1] if near is not None and abs(near[0] - stamp) <= WINDOW else None
+    return near[1] if near is not None and abs(near[0] - stamp) <= STAMP_WINDOW_S else None

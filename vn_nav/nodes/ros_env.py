@@ -1,4 +1,4 @@
-"""Robots on ROS topics as a vector environment: the learner cannot tell it from a simulator.
+"""Robots on ROS topics as a vector environment: the interface is that of a simulator.
 
 `vn_nav train --env ros`. What each robot does, and when it stands still, is
 `vn_nav.nodes.ros_robot`.
@@ -110,7 +110,7 @@ class RosEnv:
                 self._robots.append(RosRobot(self._context, name, bag=bag, **options))
                 self._executor.add_node(self._robots[-1])
         except (RuntimeError, ValueError, ParameterException) as error:  # of words that it refuses
-            raise UserError('namespaces and --ros-args are as ROS wants them',
+            raise UserError('namespaces and --ros-args follow the ROS syntax',
                             ' '.join([*namespaces, *words]), str(error).splitlines()[0]) from error
         self._thread = threading.Thread(target=self._spin, name='executor', daemon=True)
         self._thread.start()

@@ -1,4 +1,4 @@
-"""A ROS domain that nobody else is on: where the commands of a shadow end."""
+"""A ROS domain without other participants: where the commands of a shadow end."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from rclpy.signals import SignalHandlerOptions
 from vn_nav.errors import UserError
 
 DOMAINS = range(215, 233)  # beyond those that people choose; they leave Linux's ports alone
-ALONE = 3.0  # s in which others on a domain are heard of, also on a busy machine
+DISCOVERY_S = 3.0  # s in which others on a domain are discovered, also on a busy machine
 
 
 class Domain:
-    """A ROS domain that nobody else is on, with a node of ours there; a context manager."""
+    """A ROS domain without other participants, with a node of ours there; a context manager."""
 
     number: int
     _lock: IO[Any] | None  # of the file that keeps other shadows away
@@ -38,14 +38,14 @@ class Domain:
                 taken.append(f'{self.number}: another shadow')
                 continue
             self._join()
-            end = time.monotonic() + ALONE
+            end = time.monotonic() + DISCOVERY_S
             while time.monotonic() < end and not self.strangers():
                 self.executor.spin_once(timeout_sec=0.05)
             if not (strangers := self.strangers()):
                 return
             taken.append(f'{self.number}: {", ".join(strangers)}')
             self.close()
-        raise UserError('shadow mode takes a ROS domain that nobody else is on',
+        raise UserError('shadow mode needs a ROS domain without other participants',
                         '; '.join(taken), 'end some of them')
 
     def _join(self) -> None:

@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import twist_to_array
 from vn_msgs_py.topics import Topic, topic
-from vn_nav.bags.shadow.plan import RESOLUTION, Decision, Event, Plan, stamped
+from vn_nav.bags.shadow.plan import STAMP_RESOLUTION_NS, Decision, Event, Plan, stamped
 from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
 from vn_nav.nodes.policy_node import SHADOW_LIMIT
@@ -30,16 +30,16 @@ from vn_nav.nodes.qos import qos
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.nodes.shadow_domain import Domain
 
-LOOK = 0.25  # s between looks at who is there
-PATIENCE = 120.0  # s for an answer: a busy machine starts the node slowly
-LAST_WORDS = 5.0  # s for diagnostics after the last decision
-AGAIN = 0.3  # s without a picture, or an answer to it, after which it is shown again
-ARMING = 10_000_000_000, 1_000_000  # ns before the drive, and between the pictures there
+GRAPH_PERIOD_S = 0.25  # s between looks at who is there
+ANSWER_TIMEOUT_S = 120.0  # s for an answer: a busy machine starts the node slowly
+DIAGNOSTICS_TIMEOUT_S = 5.0  # s for diagnostics after the last decision
+REPEAT_PERIOD_S = 0.3  # s without a picture, or an answer to it, after which it is shown again
+ARMING_NS = 10_000_000_000, 1_000_000  # ns before the drive, and between the pictures there
 # What the policy publishes, by the names that the node gives it.
-HEARD = {'shadow/cmd_vel': Twist, 'action': Int8, 'action_names': String, 'arrived': Bool,
+SUBSCRIBED = {'shadow/cmd_vel': Twist, 'action': Int8, 'action_names': String, 'arrived': Bool,
          'diagnostics': DiagnosticArray}
 # What it is shown, beside the pictures.
-SHOWN = {'camera_info': CameraInfo, 'odom': Odometry, 'goal_image': Image, 'clock': Clock,
+PUBLISHED = {'camera_info': CameraInfo, 'odom': Odometry, 'goal_image': Image, 'clock': Clock,
          'executed_action': String}
 ABSOLUTE = ('clock', 'diagnostics')  # in the contract; here they are in the namespace as well
 
@@ -51,7 +51,7 @@ class _Interrupted(Exception):
 def shadow_topics() -> list[Topic]:
     """What the second bag holds. Below /shadow: playing it moves no robot either."""
     return [dataclasses.replace(topic(_contract(name)), name=in_bag(name))
-            for name in (*HEARD, 'goal_image', 'executed_action')]
+            for name in (*SUBSCRIBED, 'goal_image', 'executed_action')]
 
 
 def in_bag(name: str) -> str:
@@ -83,13 +83,13 @@ class Stage:
         image, kind = (('image_raw/compressed', CompressedImage) if plan.compressed
                        else ('image_raw', Image))
         self._out = {name: node.create_publisher(kind, name, qos(_contract(name)))
-                     for name, kind in (SHOWN | {image: kind}).items()}
+                     for name, kind in (PUBLISHED | {image: kind}).items()}
         self._image = self._out[image]
         self._enabler = node.create_client(SetBool, 'policy_node/enable')
         hear = {'shadow/cmd_vel': self._hear_command, 'action': self._hear_action,
                 'action_names': self._hear_names, 'arrived': self._hear_arrived,
                 'diagnostics': self._hear_diagnostics}
-        for name, kind in HEARD.items():
+        for name, kind in SUBSCRIBED.items():
             node.create_subscription(kind, name, self._recording(name, kind, hear[name]),
                                      qos(_contract(name), depth=100), raw=True)
         self._log_time = 0  # ns, by which the second bag has what is said now
@@ -144,7 +144,7 @@ class Stage:
                 self._check()
                 if event is not None:
                     self._take(event)
-                if self._picture and time.monotonic() - self._shown_at > AGAIN:
+                if self._picture and time.monotonic() - self._shown_at > REPEAT_PERIOD_S:
                     self._show(self._picture, 0)  # the node's watchdog looks at the wall clock
             self._hear_the_last_counts()
         except _Interrupted:
@@ -153,7 +153,7 @@ class Stage:
 
     def _hear_the_last_counts(self) -> None:
         """Diagnostics come once a second: those after the last decision belong in the bag."""
-        end = time.monotonic() + LAST_WORDS
+        end = time.monotonic() + DIAGNOSTICS_TIMEOUT_S
         while (int(self._diagnosis.get('filter_decisions', len(self.latencies)))
                < len(self.latencies) and time.monotonic() < end):
             self._check()
@@ -175,7 +175,7 @@ class Stage:
             self._begin(event, decision.episode)
         elif self._has_arrived:
             self._look_again()
-        stamp = max(event.stamp, self._picture_stamp + RESOLUTION)
+        stamp = max(event.stamp, self._picture_stamp + STAMP_RESOLUTION_NS)
         told = String(data=json.dumps({'stamp': divmod(stamp, 10**9), 'action': decision.done}))
         self._out['executed_action'].publish(told)
         self._bag.write(in_bag('executed_action'), serialize_message(told), self._log_time)
@@ -205,7 +205,7 @@ class Stage:
             self._look_again()
         goal = fill_image(Image(), picture)
         goal.header.stamp.sec, goal.header.stamp.nanosec = divmod(
-            event.stamp - 2 * RESOLUTION, 10**9)
+            event.stamp - 2 * STAMP_RESOLUTION_NS, 10**9)
         said = self._statements
         self._out['goal_image'].publish(goal)
         self._bag.write(in_bag('goal_image'), serialize_message(goal), self._log_time)
@@ -221,7 +221,7 @@ class Stage:
 
     def _arm(self, event: Event) -> None:
         """Show healthy pictures until the node may be enabled."""
-        (before, step), end = ARMING, time.monotonic() + PATIENCE
+        (before, step), end = ARMING_NS, time.monotonic() + ANSWER_TIMEOUT_S
         stamp, ask_at, answer = event.stamp - before, 0.0, 'nothing'
         # Once, and long before the node may move: whatever comes after that is answered.
         self._out['odom'].publish(stamped(self._pose, event.stamp))
@@ -237,9 +237,10 @@ class Stage:
                 granted, answer = self._enable()
                 if granted:
                     return
-                ask_at = time.monotonic() + LOOK
+                ask_at = time.monotonic() + GRAPH_PERIOD_S
             if time.monotonic() > end:
-                raise UserError('the policy node can be enabled', answer, 'see what it misses')
+                raise UserError('the policy node can be enabled', answer,
+                                'see the reasons in its diagnostics')
 
     def _look_again(self) -> None:
         """After a statement of arrival: on with the same goal, with an empty memory."""
@@ -248,7 +249,7 @@ class Stage:
         if not granted:
             raise UserError('the policy node can be enabled again', answer,
                             'try again when the machine is less busy')
-        self._until(lambda: self._statements > said, 'that it does not stand there any more')
+        self._until(lambda: self._statements > said, 'the end of the declared stop')
 
     def _enable(self) -> tuple[bool, str]:
         call = ServiceCall(self._enabler, SetBool.Request(data=True))
@@ -256,7 +257,7 @@ class Stage:
         return call.answer.success, call.answer.message
 
     def _show(self, data: bytes, stamp: int) -> None:
-        self._picture_stamp = max(stamp, self._picture_stamp + RESOLUTION)
+        self._picture_stamp = max(stamp, self._picture_stamp + STAMP_RESOLUTION_NS)
         self._picture = stamped(data, self._picture_stamp)
         self._set_clock(self._picture_stamp)
         self._image.publish(self._picture)
@@ -291,14 +292,14 @@ class Stage:
 
     def _until(self, condition: Callable, what: str, *, resend: bool = False) -> None:
         """Serve what comes in until a condition holds."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + ANSWER_TIMEOUT_S
         while not condition():
             self._check()
             if time.monotonic() > end:
-                raise UserError(f'the policy node answers within {PATIENCE:g} s',
+                raise UserError(f'the policy node answers within {ANSWER_TIMEOUT_S:g} s',
                                 f'waited for {what}; it says {self._state()}',
                                 'try again when the machine is less busy')
-            if resend and time.monotonic() - self._shown_at > AGAIN:
+            if resend and time.monotonic() - self._shown_at > REPEAT_PERIOD_S:
                 self._image.publish(self._picture)  # pictures may be lost; it knows one it has
                 self._shown_at = time.monotonic()
             self._domain.executor.spin_once(timeout_sec=0.05)
@@ -310,7 +311,7 @@ class Stage:
         now = time.monotonic()
         if now < self._look_at:
             return
-        self._look_at = now + LOOK
+        self._look_at = now + GRAPH_PERIOD_S
         self._processes.check('policy')
         if self._processes.running['policy'].poll() is not None:
             raise ProcessFailure('the policy node has ended')

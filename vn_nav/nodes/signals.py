@@ -2,7 +2,7 @@
 
 A node has four times. While it imports, nothing exists yet: a signal ends the process at once.
 While it works, a signal is noted, and the work ends soon. Compiling cannot be interrupted halfway
-(an exception from a signal handler is lost in LLVM's callbacks): a signal lets go of the node and
+(an exception from a signal handler is lost in LLVM's callbacks): a signal releases the node and
 ends the process. While the process ends, further signals are ignored: a terminal and `ros2 launch`
 may both send one, and the interpreter takes its handlers away before it is gone.
 """
@@ -79,6 +79,6 @@ class Ended:
             self._let_go = None
 
     def restore(self) -> None:
-        """Leave the signals to whoever heard them before."""
+        """Restore the previous signal handlers."""
         for number, handler in self._before.items():
             signal.signal(number, handler)

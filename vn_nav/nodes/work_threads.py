@@ -30,11 +30,11 @@ class WorkThreads:
         return self
 
     def is_running(self) -> bool:
-        """They have not been told to end."""
+        """They have not been asked to end."""
         return not self._ended
 
     def end(self) -> None:
-        """Tell them to end; wake them afterwards."""
+        """Ask them to end; wake them afterwards."""
         self._ended = True
 
     def join(self, name: str, timeout: float | None = None) -> bool:

@@ -1,16 +1,17 @@
 """The action filter: a memory of blocked actions, between the policy's logits and its action.
 
 A contact ends a move, and a picture as before follows. A network sees it, and has hardly ever been
-taught what follows from it: it tries again, or turns away and at once back. Where nothing decides
-between two ways it turns to and fro. The filter remembers what led nowhere and offsets the logits.
+trained on the consequence: it tries again, or turns away and at once back. Where nothing decides
+between two ways it turns to and fro. The filter remembers actions without progress and offsets
+the logits.
 It reads the pictures and the policy's own last actions, nothing else, so that it works the same on
-a robot, in every simulator, in training and beside an exported network.
+a robot, in every simulator, in training and with an exported network.
 
 The rule, the state and when it is forgotten: docs/method.md, "The action filter". The field
 `action_filter` of the network in a checkpoint's `config.json` says whether it is on (`FILTERS`).
 Everything here needs NumPy alone. Given tensors it computes the same on their device.
 
-Beside ONNX Runtime:
+With ONNX Runtime:
 
     blocked = BlockedActionFilter(json.loads(metadata['moves']), 1)
     ...
@@ -37,7 +38,7 @@ THUMBNAIL_SIDE = 8  # pixels of the small pictures that are compared, in which n
 # Mean difference of two of them [grey levels] below which nothing has moved. With noise, on the
 # spot: 0.3; after half a metre: 7 in one of twenty (bench/teach_and_drive.py's house).
 UNCHANGED_GREY_LEVELS = 2.0
-HEADINGS = 72  # that are told apart, 5 deg each
+HEADINGS = 72  # that are distinguished, 5 deg each
 BLOCKED_HEADINGS = 3  # a contact counts in headings up to so many from its own: 15 deg
 BLOCKED_LOGITS = 20.0  # off the logit of an action that is blocked here: 2e-9 of its odds are left
 FACING_LOGITS = 10.0  # off the logit of a turn whose end faces what is blocked
@@ -47,7 +48,7 @@ SEEN_RAD, RESTLESS_RAD = math.radians(240), math.radians(60)
 
 
 class BlockedActionFilter:
-    """Of N robots: which actions have led nowhere from where they stand, and how far they turned.
+    """Of N robots: the actions without progress at their places, and how far they turned.
 
     Args:
         moves: [A][3] dx, dy [m], dyaw [rad] of the actions.

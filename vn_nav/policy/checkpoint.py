@@ -231,8 +231,8 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
             config['decoding']],
         'Network': f'{_describe(network)}; {parameters:,} parameters, {size / 1e6:.1f} MB',
-        **({'Action filter': 'blocked actions: what led nowhere is not done again from there; '
-            'part of every figure (docs/method.md)'}
+        **({'Action filter': 'blocked actions: an action without progress is not repeated '
+            'from the same place; part of every figure (docs/method.md)'}
            if network.get('action_filter', NONE) != NONE else {}),
         'Trained in': config['data'] or home,
         **({'Losses': ', '.join(config['losses']).replace('_', ' ')} if config['losses'] else {}),

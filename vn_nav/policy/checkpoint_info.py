@@ -19,7 +19,7 @@ OWN = {'format', 'network', 'action_names', 'sha256'}  # keys beside those of IN
 CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
 DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
-# What a checkpoint says beside its weights, and what it says when nobody told it.
+# What a checkpoint says beside its weights, and its defaults.
 INFO: dict[str, Any] = {
     'world_version': REQUIRED,  # of the simulator's pixels, places and motion
     'camera_fov_deg': REQUIRED,  # of the square picture
@@ -54,7 +54,7 @@ class Rule(NamedTuple):
 
 
 TEXT, LIST, INTEGER, NUMBER = (str,), (list, tuple), (int,), (int, float)
-# None is allowed where it is the value when nobody told.
+# None is allowed where it is the default.
 INFO_TYPES = {
     'world_version': Rule(TEXT), 'decoding': Rule(TEXT), 'task': Rule(TEXT),
     'randomisation': Rule(TEXT), 'preset': Rule(TEXT), 'command': Rule(TEXT),
@@ -118,7 +118,7 @@ def check_info(info: dict, where: str) -> dict:
     info = _named_scenes(info, where)
     unknown = sorted(info.keys() - INFO.keys())
     if unknown:
-        raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} beside the network',
+        raise UserError(f'{CONFIG} has only the keys {", ".join(INFO)} in addition to the network',
                         f'{unknown[0]} in {where}', 'remove it, or use the version of vn_nav '
                         'that wrote it')
     full = {key: info.get(key, default) for key, default in INFO.items()}

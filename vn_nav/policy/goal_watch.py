@@ -1,4 +1,4 @@
-"""Tells a new goal from one that is published again."""
+"""Distinguishes a new goal from a repeated one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class GoalWatch:
             now: steady time [s].
         """
         if (stamp, picture) == self._identity:
-            return False  # heard twice, or latched and heard again
+            return False  # received twice, or latched and received again
         soon = bool(self._heard) and now - self._heard[-1][0] <= AGAIN_S
         same = self._identity is not None and self._identity[1] == picture
         self._repeats = self._repeats + 1 if same and soon else 0

@@ -311,9 +311,9 @@ class Navigator:
             now: steady time [s]; dt: length of the period [s].
             odometry: [3] x, y, yaw, or None where there is none.
             stamp: present time in the frames' clock [s].
-            odometry_lost: there was odometry, and it fell silent: nobody drives blind.
+            odometry_lost: there was odometry, and it is stale: no motion without it.
         """
-        if self._settles:  # what moved is told to stand still now
+        if self._settles:  # what moved gets a zero command now
             self._settles = False
             if not (self.continuous or self.exact):
                 self._look_after = max(self._look_after, stamp + self.limits.settle_time)

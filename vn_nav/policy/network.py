@@ -31,7 +31,7 @@ from vn_nav.policy.memory import (
     stack_frames,
 )
 from vn_nav.policy.network_config import IMAGE_HEADS, NetworkConfig
-from vn_nav.policy.places import WIDTH, MultiViewAveraging, PlaceClassifier, Routes
+from vn_nav.policy.places import WIDTH, MultiViewAveraging, PathAdvice, PlaceClassifier
 from vn_nav.policy.zhu import SceneLinear, Siamese
 
 # Pictures go through the encoder in parts of this size on a processor: larger float32 pixels are
@@ -79,7 +79,7 @@ class Policy(nn.Module):
     critic: nn.Linear | SceneLinear
     tracker: GoalTracker | None
     places: PlaceClassifier | None
-    routes: Routes | None
+    routes: PathAdvice | None
     around: MultiViewAveraging | None
 
     def __init__(self, config: NetworkConfig):
@@ -119,7 +119,7 @@ class Policy(nn.Module):
                 self.around = MultiViewAveraging(config.moves, config.places)
             self.places = PlaceClassifier(config.size, config.places, config.pixel_mean,
                                           config.pixel_std)
-            self.routes = Routes(self.places.width, len(config.actions))
+            self.routes = PathAdvice(self.places.width, len(config.actions))
             with torch.no_grad():
                 self._goal_shape = encoder.encode_goals(
                     torch.zeros(1, 3, config.size, config.size, dtype=torch.uint8),

@@ -18,8 +18,8 @@ from torch.nn import functional as F
 
 from vn_nav.policy.encoders import Matching, Pixels, apply, directions, orthogonal
 
-HEADINGS = 16  # directions that are told apart
-WIDTH = 128  # of what the memory is told
+HEADINGS = 16  # directions that are distinguished
+WIDTH = 128  # of the place features for the memory
 
 
 class PlaceClassifier(nn.Module):
@@ -137,7 +137,7 @@ class MultiViewAveraging(nn.Module):
                          dim=2), before
 
 
-class Routes(nn.Module):
+class PathAdvice(nn.Module):
     """Which way it is from where the robot is to where the goal was taken.
 
     Two hidden layers, read by the memory, and an advice to the actor: both are first taught the
@@ -164,5 +164,5 @@ class Routes(nn.Module):
 
 
 def heading_cells(device: torch.device | str = 'cpu') -> Tensor:
-    """[16] the headings that are told apart [rad]."""
+    """[16] the headings that are distinguished [rad]."""
     return torch.arange(HEADINGS, device=device) * (2 * math.pi / HEADINGS)

@@ -122,11 +122,11 @@ class PolicyRuntime:
         self._last_action = -1
 
     def correct(self, action: int) -> None:
-        """Say what was really done since `act`, where somebody else drives.
+        """Say what was really done since `act`, where another driver has control.
 
         Args:
             action: -1: none of the policy's. The memory is emptied then, as in pre-training: the
-                network cannot have been told of that motion.
+                network has not seen that motion.
         """
         if self._last_action >= 0:  # else an episode begins
             self._last_action = action

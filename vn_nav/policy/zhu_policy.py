@@ -75,7 +75,7 @@ class ScenePolicy(Policy):
             return torch.zeros_like(obs.last_action)
         extras = obs.extras or {}
         if 'scene' not in extras:
-            raise UserError('a network with layers for several scenes is told the scene',
+            raise UserError('a network with layers for several scenes needs the scene',
                             "observations without extras['scene']", 'pass it, or train and use '
                             'a network of one scene')
         return extras['scene']

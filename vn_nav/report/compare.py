@@ -46,7 +46,7 @@ def compare(paths: Sequence[Path], out: Path, *, metric: str = 'success',
                         'give --out another ending')
     groups = grouped(read_runs(paths, metric, labels))
     if len(groups) > CURVES:
-        raise UserError(f'a chart tells {CURVES} curves apart', len(groups),
+        raise UserError(f'a chart has at most {CURVES} curves', len(groups),
                         'compare fewer at a time, or give seeds of one thing one label')
     result = summary(groups)
     shapes, height = _chart(groups, metric, band, log)

@@ -35,7 +35,7 @@ def write_report(path: Path, drives: list[Drive], result: dict) -> None:
 policy were two processes that met on ROS topics alone. The policy saw the camera, the goal picture
 and its own last action; no map, no pose, no depth.</p>
 {body}
-<h2>What the words mean</h2><dl>{_declared_stop(result['trained'])}
+<h2>Definitions</h2><dl>{_declared_stop(result['trained'])}
 <dt>Success</dt><dd>At the end of a decision the robot stands within {ARRIVAL_RADIUS:g} m of the
 place (driving distance) and faces within {math.degrees(ARRIVAL_HEADING):g} degrees of the
 picture's direction. In brackets the 95 % interval.</dd>
@@ -53,8 +53,8 @@ def _declared_stop(figures: dict) -> str:
     if 'false_stops' not in figures:
         return ''
     return """
-<dt>Declared stop</dt><dd>Being there is not enough: the policy itself has to say that it has
-arrived, which ends the episode. Said elsewhere it is a false stop.</dd>"""
+<dt>Declared stop</dt><dd>Being there is not enough: the policy itself has to declare that it has
+arrived, which ends the episode. Declared elsewhere it is a false stop.</dd>"""
 
 
 def _place(place: str, drive: Drive, figures: dict) -> str:

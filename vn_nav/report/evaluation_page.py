@@ -17,12 +17,12 @@ from vn_nav.report.page import cards, page
 from vn_nav.report.tables import SPLITS, TITLES, number, rows_html, scenes_html
 
 MAPS = 6  # of a split, unless the user asks for another number
-WORDS = f"""<h2>What the words mean</h2><dl>
+WORDS = f"""<h2>Definitions</h2><dl>
 <dt>Arrival</dt><dd>The simulator ends an episode as soon as the robot stands, at the end of a
 decision, within {ARRIVAL_RADIUS:g} m of the goal (driving distance) and faces within
 {math.degrees(ARRIVAL_HEADING):g} degrees of the picture's
 direction. That is success. (Other tasks than pictures of places have rules of their own.)</dd>
-<dt>Declared stop</dt><dd>The robot has to say that it has arrived. Success needs arrival at that
+<dt>Declared stop</dt><dd>The robot has to declare arrival. Success needs arrival at that
 moment; a false stop ends the episode. <i>Declared</i> and <i>false stops</i> are shares of
 episodes; <i>reached</i> is the share in which the robot was at its goal at some time.</dd>
 <dt>SPL</dt><dd>Success weighted by path length: 1 means that every journey succeeded on the
@@ -32,7 +32,7 @@ undiscounted reward.</dd>
 <dt>Collisions, contact-free</dt><dd>Share of decisions that touched something; share of episodes
 that succeeded without any.</dd>
 <dt>Filter acted, filter changed</dt><dd>Share of decisions at which the policy's action filter
-offset an action (what led nowhere from there is blocked, and after much turning driving on is
+offset an action (an action without progress there is blocked, and after much turning driving on is
 pushed); share at which another action came out than without it.</dd>
 <dt>Stop error</dt><dd>Distance and angle to the goal at the end of all episodes.</dd>
 <dt>Wrong goal, blank goal</dt><dd>The same policy on the same starts, but shown the picture of

@@ -1,4 +1,4 @@
-"""Tables in a terminal: nothing is cut off, whatever the terminal's width."""
+"""Tables in a terminal: nothing is cut off at any width."""
 
 from __future__ import annotations
 

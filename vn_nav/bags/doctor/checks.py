@@ -1,4 +1,4 @@
-"""What is wrong with a recorded drive, before somebody trains on it: one pass over the bag."""
+"""What is wrong with a recorded drive, before it is used for training: one pass over the bag."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.doctor.figures import (
-    BACK,
     ERROR,
+    SET_BACK_NS,
     WARNING,
     Command,
     Diagnosis,
@@ -27,22 +27,24 @@ from vn_nav.bags.doctor.figures import (
     Neighbours,
 )
 from vn_nav.bags.roles import TYPES, Topics, fits, full_name, proposal, remedy, replaced
-from vn_nav.bags.stamped import GAP, WINDOW
+from vn_nav.bags.stamped import EPISODE_GAP_S, STAMP_WINDOW_S
 from vn_nav.bags.storage.decoding import Decoder, Ros1
 from vn_nav.bags.storage.stream import UNLISTED, Bag, BagError, Connection, Message
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction
 
-LOOK = 500_000_000  # ns between pictures that are decoded
-BLACK = 16  # of 255: no pixel of a picture's thumbnail is brighter
-FLAT = 1.0  # of 255: standard deviation of a thumbnail in which there is nothing to see
-STILL = 0.05  # m and rad that a robot has to go, or it stands
-MOVES = 0.1  # m or rad that a robot goes while a picture must not stay the same
-JUMP = 1_000_000_000  # ns by which clocks may disagree from one message to the next
-SKEW = 500_000_000  # ns by which two sensors' stamps may lag behind differently
-SIMULATED = 10**17  # ns (three years): stamps so far from the recorder's time are a simulation's
-MOST_ALONE = 0.05  # share of pictures that may be without a pose beside them
-TOLD = 5  # places of damage that are told one by one
+PICTURE_PERIOD_NS = 500_000_000  # ns between pictures that are decoded
+BLACK_LEVEL = 16  # of 255: no pixel of a picture's thumbnail is brighter
+# Of 255: a thumbnail with a smaller standard deviation shows nothing.
+FLAT_SIGMA_LEVELS = 1.0
+MIN_TRAVEL_M_RAD = 0.05  # m and rad: a robot that moves less stands still
+FROZEN_TRAVEL_M_RAD = 0.1  # m or rad: after this motion an unchanged picture is a fault
+CLOCK_JUMP_NS = 1_000_000_000  # ns by which clocks may disagree from one message to the next
+CLOCK_SKEW_NS = 500_000_000  # ns by which two sensors' stamps may lag behind differently
+# Three years: stamps farther from the recorder's time are simulated time.
+SIMULATED_OFFSET_NS = 10**17
+MAX_SHARE_WITHOUT_POSE = 0.05  # share of pictures that may be without a matching pose
+MAX_LISTED_DAMAGE = 5  # places of damage that are listed
 STAMPED = ('image', 'depth', 'labels', 'odometry')  # roles that are put together by their stamps
 CLOCK = 'rosgraph_msgs/msg/Clock'
 RECOVER = 'save what is whole with `vn_nav bag recover`'
@@ -67,7 +69,7 @@ class _Doctor:
         self.start: int | None = None
         self.end = 0
         self._odometry, self._command = Motion(), Command()
-        self._poses = Neighbours(1e9 * WINDOW)
+        self._poses = Neighbours(1e9 * STAMP_WINDOW_S)
         self._info: Any = None
         self._last: Message | None = None
 
@@ -96,7 +98,7 @@ class _Doctor:
         topic.count += 1
         topic.bytes += len(message.data)
         passed = topic.logged.add(at, at)
-        if passed <= -BACK:
+        if passed <= -SET_BACK_NS:
             topic.recorder_back.add(passed, at)
         if not topic.usable:
             return
@@ -138,7 +140,7 @@ class _Doctor:
             self._poses.pose(stamp)
         if first or topic.role not in STAMPED:
             return
-        if step <= -BACK:
+        if step <= -SET_BACK_NS:
             topic.set_back.add(step, at)
         elif step < 0:
             self.find(WARNING, topic.connection.topic, 'unordered', 'has stamps that go back', at,
@@ -147,7 +149,7 @@ class _Doctor:
             self.find(WARNING, topic.connection.topic, 'repeated', 'has the same stamp twice', at,
                       DRIVER + ': such messages are left out')
         # A message that comes late makes the recorder's clock run ahead, not this one.
-        if topic.jump is None and step - passed > JUMP:
+        if topic.jump is None and step - passed > CLOCK_JUMP_NS:
             topic.jump = step - passed, at
 
     def _examine(self, topic: HeardTopic, message: Message, at: int) -> None:
@@ -176,7 +178,7 @@ class _Doctor:
         raw = not hasattr(value, 'format')
         if raw:
             self._shape(topic, f'{_short(value.encoding)} {value.width} x {value.height}', at)
-        if topic.looked is not None and abs(at - topic.looked) < LOOK:
+        if topic.looked is not None and abs(at - topic.looked) < PICTURE_PERIOD_NS:
             return
         topic.looked = at
         if topic.role in ('depth', 'labels'):
@@ -187,10 +189,10 @@ class _Doctor:
             self._shape(topic, f'{_short(value.format)} {picture.shape[1]} x '
                         f'{picture.shape[0]}', at)
         small = cv2.resize(picture, (16, 16), interpolation=cv2.INTER_AREA)
-        if small.max() < BLACK:
-            self.find(WARNING, name, 'black', 'is black', at, 'take off the cap, switch on the '
+        if small.max() < BLACK_LEVEL:
+            self.find(WARNING, name, 'black', 'is black', at, 'remove the lens cap, switch on the '
                       'light, or leave this part out')
-        elif small.std() < FLAT:
+        elif small.std() < FLAT_SIGMA_LEVELS:
             self.find(WARNING, name, 'flat', 'shows one colour', at, 'check exposure and lens, or '
                       'leave this part out')
 
@@ -198,7 +200,7 @@ class _Doctor:
         if topic.pictures and shape not in topic.pictures and topic.role != 'goal':
             self.find(ERROR, topic.connection.topic, 'shape', f'changes to {shape}', at,
                       'split the bag where the camera changes')
-        if len(topic.pictures) < TOLD:
+        if len(topic.pictures) < MAX_LISTED_DAMAGE:
             topic.pictures[shape] = None
 
     def _frozen(self, topic: HeardTopic, data: np.ndarray, at: int) -> None:
@@ -210,7 +212,7 @@ class _Doctor:
                 and np.array_equal(data, topic.before))
         if not same:
             topic.before, topic.moved_before = data, moved
-        elif moved - topic.moved_before > MOVES:
+        elif moved - topic.moved_before > FROZEN_TRAVEL_M_RAD:
             self.find(ERROR, topic.connection.topic, 'frozen', 'stays the same while the robot '
                       'moves', at, 'check the camera and its cable, or leave this part out')
 
@@ -225,7 +227,7 @@ class _Doctor:
         if not (math.isfinite(lens[0]) and lens[0] > 0 and lens[1] > 0 and lens[2] > 0):
             self.find(WARNING, name, 'focal', f'has a focal length of {lens[0]:g} pixels at '
                       f'{lens[1]} x {lens[2]}', at, 'calibrate the camera (camera_calibration): '
-                      'pictures cannot be cropped to what a policy knows')
+                      'pictures cannot be cropped for a policy')
         elif self._fov is not None:
             fov = field_of_view(*lens[1:], lens[0])
             try:
@@ -245,7 +247,7 @@ class _Doctor:
         self._missing(roles)
         lags = {topic.connection.topic: lag for role in STAMPED for topic in roles[role]
                 if topic.stamps.last and (lag := topic.lag.median()) is not None}
-        simulated = bool(lags) and min(map(abs, lags.values())) > SIMULATED or any(
+        simulated = bool(lags) and min(map(abs, lags.values())) > SIMULATED_OFFSET_NS or any(
             full_name(topic.connection.type) == CLOCK for topic in self.topics.values())
         for topic in (t for role in STAMPED for t in roles[role]):
             self._gaps(topic, simulated)
@@ -263,14 +265,14 @@ class _Doctor:
     def _damage(self, bag: Bag) -> None:
         for number, loss in enumerate(bag.losses):
             at = loss.before if loss.before is not None else loss.after
-            key = f'damage {number}' if number < TOLD else 'damage'
+            key = f'damage {number}' if number < MAX_LISTED_DAMAGE else 'damage'
             what = f'{loss.path}, byte {loss.offset}: {loss.reason}'
-            if number >= TOLD:
-                what = f'more of the same: {what}'
+            if number >= MAX_LISTED_DAMAGE:
+                what = f'further occurrences: {what}'
             self.find(WARNING if loss.reason == UNLISTED else ERROR, '', key, what, at, RECOVER)
         if bag.path.is_dir() and not (bag.path / 'metadata.yaml').is_file():
-            self.find(WARNING, '', 'metadata', 'has no metadata.yaml', None, 'other programs want '
-                      'one: ' + RECOVER)
+            self.find(WARNING, '', 'metadata', 'has no metadata.yaml', None, 'other programs need '
+                      'it: ' + RECOVER)
 
     def _missing(self, roles: dict[str, list[HeardTopic]]) -> None:
         free = {t.connection.topic: t.connection.type for t in self.topics.values()
@@ -294,25 +296,25 @@ class _Doctor:
                       f'commands ({self._names.command})', None, candidates('odometry'))
         elif not roles['odometry']:
             self.find(WARNING, '', 'odometry', f'has no odometry ({self._names.odometry}): '
-                      'commands stand in, which drift', None, candidates('odometry'))
+                      'poses are integrated from commands and drift', None, candidates('odometry'))
         if roles['image'] and not roles['camera_info']:
-            self.find(WARNING, '', 'camera_info', 'does not say how wide the camera sees '
+            self.find(WARNING, '', 'camera_info', 'has no camera calibration '
                       f'({self._names.camera_info})', None, candidates('camera_info'))
 
     def _gaps(self, topic: HeardTopic, simulated: bool) -> None:
         times = topic.stamps if topic.stamps.last else topic.logged
         name, median = topic.connection.topic, times.gaps.median()
-        if topic.role in ('image', 'odometry') and times.worst > GAP * 1e9:
+        if topic.role in ('image', 'odometry') and times.worst > EPISODE_GAP_S * 1e9:
             self.find(WARNING, name, 'gap', f'pauses for up to {times.worst * 1e-9:.1f} s',
                       times.worst_at, 'episodes end there' + (
                           ': have the simulator publish it more often' if simulated else
                           '; record with a faster disk or network'))
-        if (topic.role == 'odometry' and median is not None and median > 2e9 * WINDOW
-                and self._poses.alone > MOST_ALONE * self._poses.pictures):
+        if (topic.role == 'odometry' and median is not None and median > 2e9 * STAMP_WINDOW_S
+                and self._poses.alone > MAX_SHARE_WITHOUT_POSE * self._poses.pictures):
             share = self._poses.alone / self._poses.pictures
             self.find(ERROR, name, 'rate', f'comes at {1e9 / median:.1f} Hz: {share:.0%} of the '
-                      f'pictures have no pose within {WINDOW * 1e3:.0f} ms', None,
-                      f'publish it at {1 / WINDOW:.0f} Hz')
+                      f'pictures have no pose within {STAMP_WINDOW_S * 1e3:.0f} ms', None,
+                      f'publish it at {1 / STAMP_WINDOW_S:.0f} Hz')
 
     def _set_back(self, roles: dict[str, list[HeardTopic]]) -> None:
         """Clocks that were set back: of the stamps, and of the recorder."""
@@ -329,7 +331,7 @@ class _Doctor:
                 serious = not alike and topic in moving
                 self.find(ERROR if serious else WARNING, topic.connection.topic, what,
                           f'{what} by a clock that was set back by {-back.first * 1e-9:.1f} s',
-                          back.at, 'pictures and poses do not fit together behind it: '
+                          back.at, 'pictures and poses do not match after it: '
                           'synchronise the clocks (chrony), and record again' if serious else
                           'a simulator was reset, or these are two takes: an episode ends there',
                           back.count)
@@ -344,23 +346,23 @@ class _Doctor:
                       f'{jump * 1e-9:.1f} s', at, 'synchronise the clocks (chrony) before '
                       'recording; split the bag here')
         for name, lag in lags.items():
-            if abs(lag) > JUMP:
+            if abs(lag) > CLOCK_JUMP_NS:
                 self.find(WARNING, name, 'skew', f'is stamped {lag * 1e-9:.1f} s before it is '
                           'recorded', None, 'synchronise the clocks (chrony)')
         late, early = max(lags, key=lags.__getitem__), min(lags, key=lags.__getitem__)
-        if lags[late] - lags[early] > SKEW:
+        if lags[late] - lags[early] > CLOCK_SKEW_NS:
             self.find(ERROR, late, 'skew to others', 'is stamped '
                       f'{(lags[late] - lags[early]) * 1e-9:.1f} s earlier than {early} at the '
                       'same time', None, 'synchronise the clocks (chrony), or stamp both on one '
                       'computer')
 
     def _standing(self, roles: dict[str, list[HeardTopic]]) -> None:
-        told = self._command.total > STILL
-        if self._odometry.heard and self._odometry.reach < STILL:
+        commanded = self._command.total > MIN_TRAVEL_M_RAD
+        if self._odometry.heard and self._odometry.reach < MIN_TRAVEL_M_RAD:
             self.find(ERROR, roles['odometry'][0].connection.topic, 'still',
-                      'never moves' + ', though the robot is told to' * told, None,
-                      'check the wheel encoders' if told else 'drive while recording')
-        elif not roles['odometry'] and roles['command'] and not told:
+                      'never moves' + ', although the commands are not zero' * commanded, None,
+                      'check the wheel encoders' if commanded else 'drive while recording')
+        elif not roles['odometry'] and roles['command'] and not commanded:
             self.find(ERROR, roles['command'][0].connection.topic, 'still', 'never moves the '
                       'robot', None, 'drive while recording')
 

@@ -10,14 +10,15 @@ import statistics
 
 import numpy as np
 
-from vn_nav.bags.drive import COMMAND_LASTS
-from vn_nav.bags.stamped import WAIT
+from vn_nav.bags.drive import COMMAND_TIMEOUT_S
+from vn_nav.bags.stamped import PAIRING_TIMEOUT_S
 from vn_nav.bags.storage.stream import Connection
 
 ERROR, WARNING = 'error', 'warning'
-SAMPLE = 4096  # numbers that a median is taken of, at most
-BACK = round(1e9 * WAIT)  # ns by which a clock goes back that was set back, see `set_back`
-NOISE = 0.0005  # m and rad: smaller steps of a standing robot must not add up
+MEDIAN_SAMPLES = 4096  # numbers that a median is taken of, at most
+# A clock that goes back by this much was set back, see `set_back`.
+SET_BACK_NS = round(1e9 * PAIRING_TIMEOUT_S)
+ODOMETRY_NOISE_M_RAD = 0.0005  # m and rad: smaller steps of a standing robot must not add up
 
 
 class Neighbours:
@@ -26,13 +27,13 @@ class Neighbours:
     def __init__(self, window: float):
         self.pictures = self.alone = 0
         self._window, self._pose = window, -math.inf
-        self._waiting: collections.deque[int] = collections.deque(maxlen=SAMPLE)
+        self._waiting: collections.deque[int] = collections.deque(maxlen=MEDIAN_SAMPLES)
 
     def picture(self, stamp: int) -> None:
         self._waiting.append(stamp)
 
     def pose(self, stamp: int) -> None:
-        while self._waiting and stamp <= self._pose - BACK:  # nothing more comes for these
+        while self._waiting and stamp <= self._pose - SET_BACK_NS:  # nothing more comes for these
             self.pictures += 1
             self.alone += abs(self._waiting.popleft() - self._pose) > self._window
         while self._waiting and self._waiting[0] <= stamp:
@@ -96,7 +97,7 @@ class Sample:
         if self._number % self._stride == 0:
             # Times reach 2^63 - 1, and their differences beyond.
             self._kept.append(max(-(2**63), min(value, 2**63 - 1)))
-            if len(self._kept) == SAMPLE:
+            if len(self._kept) == MEDIAN_SAMPLES:
                 self._kept, self._stride = self._kept[::2], 2 * self._stride
         self._number += 1
 
@@ -179,7 +180,7 @@ class Motion:
             self._first = self._last = values[:3]
         self.reach = max(self.reach, _distance(self._first, values))
         step = _distance(self._last, values)
-        if step >= NOISE:
+        if step >= ODOMETRY_NOISE_M_RAD:
             self.total += step
             self._last = values[:3]
 
@@ -190,13 +191,13 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 class Command:
-    """How far the robot was told to go."""
+    """How far the commands would move the robot."""
 
     def __init__(self):
         self.total = 0.0
         self._speed, self._since = 0.0, 0
 
     def hear(self, velocity: np.ndarray, at: int) -> None:
-        seconds = min(max((at - self._since) * 1e-9, 0.0), COMMAND_LASTS)
+        seconds = min(max((at - self._since) * 1e-9, 0.0), COMMAND_TIMEOUT_S)
         self.total += self._speed * seconds
         self._speed, self._since = float(np.abs(velocity[:3]).sum()), at

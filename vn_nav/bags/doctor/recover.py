@@ -60,9 +60,9 @@ class Recovered:
         if not self.lost:
             return 'lost: nothing that was in the file' + 's' * (len(self.losses) > 1)
         if self.missing is None:
-            return 'lost messages: unknown, as a file without its end does not count them'
-        more = (f'; {self.surplus} more than the file counts: so many were changed, or never '
-                'were, and which cannot be known') * bool(self.surplus)
+            return 'lost messages: unknown, because a file without its end has no message counts'
+        more = (f'; {self.surplus} more than the file counts: so many are corrupt or '
+                'invented; which ones cannot be determined') * bool(self.surplus)
         return f'lost messages: {self.missing}{more}'
 
 
@@ -81,7 +81,7 @@ def recover(source: str | Path, target: str | Path) -> Recovered:
     """
     source, target = Path(source), Path(target)
     if target.exists() or target.is_symlink():
-        raise UserError('a bag is recovered into a new place', str(target), 'choose another')
+        raise UserError('a bag is recovered into a new folder', str(target), 'choose another')
     if source.is_dir() and source.resolve() in target.resolve().parents:
         raise UserError('a damaged bag is left as it is', f'{target}, within it',
                         'choose another place')
@@ -164,7 +164,7 @@ def _quality(channel: Connection) -> list:
         return []
     try:
         profiles = load_yaml(text)
-    except Exception:  # of a file that nobody vouches for; a bag plays without
+    except Exception:  # of an untrusted file; a bag plays without
         return []
     whole = isinstance(profiles, list) and all(isinstance(p, dict) for p in profiles)
     return profiles if whole else []

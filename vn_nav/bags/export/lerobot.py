@@ -25,7 +25,7 @@ from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav import __version__
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.drive import (
-    COMMAND_LASTS,
+    COMMAND_TIMEOUT_S,
     Frame,
     Report,
     TimestampedMessage,
@@ -47,8 +47,9 @@ FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
 FIRST = FILE.format(chunk_index=0, file_index=0)
 NUMBERS = {'timestamp': 'float32', 'frame_index': 'int64', 'episode_index': 'int64',
            'index': 'int64', 'task_index': 'int64'}
-FASTEST = 120  # frames a second
-KEPT = 65_536  # velocities that wait for their picture, at most: minutes at any rate
+MAX_FPS = 120  # frames a second
+# Velocities that wait for their picture: minutes at any rate.
+MAX_WAITING_VELOCITIES = 65_536
 
 
 CARD = """---
@@ -100,8 +101,8 @@ def export(bag: str | Path, out: str | Path, *, topics: Topics, robot: str, fps:
     """
     _need_packages()
     out = Path(out)
-    if not 1 <= fps <= FASTEST:
-        raise UserError(f'a dataset has 1 to {FASTEST} frames a second', fps, 'correct --fps')
+    if not 1 <= fps <= MAX_FPS:
+        raise UserError(f'a dataset has 1 to {MAX_FPS} frames a second', fps, 'correct --fps')
     if out.exists():
         raise UserError('a dataset is written into a new folder', str(out),
                         'choose another one, or take that one away')
@@ -129,17 +130,17 @@ def _need_packages() -> None:
 
 
 class _Velocities:
-    """Velocities as they were heard, until nobody asks for them any more."""
+    """Received velocities, until they are no longer needed."""
 
     def __init__(self):
-        # Rows come later than what was heard: two runs, where a clock was set back in between.
+        # Rows come later than velocities: two runs, where a clock was set back in between.
         self._runs: list[collections.deque[tuple[float, np.ndarray]]] = [
-            collections.deque(maxlen=KEPT)]
+            collections.deque(maxlen=MAX_WAITING_VELOCITIES)]
 
     def hear(self, at: float, velocity: np.ndarray) -> None:
         run = self._runs[-1]
         if run and set_back(at, run[-1][0]):
-            self._runs = [run, collections.deque(maxlen=KEPT)]
+            self._runs = [run, collections.deque(maxlen=MAX_WAITING_VELOCITIES)]
             run = self._runs[-1]
         if not run or at > run[-1][0]:
             run.append((at, velocity))
@@ -166,7 +167,7 @@ class _Velocities:
         return (min(both, key=lambda entry: abs(entry[0] - at))[1] if both else np.zeros(3))
 
     def mean(self, begin: float, end: float) -> np.ndarray:
-        """Of velocities that hold until the next one, or for `COMMAND_LASTS` s.
+        """Of velocities that hold until the next one, or for `COMMAND_TIMEOUT_S` s.
 
         Args:
             begin: s.
@@ -180,7 +181,7 @@ class _Velocities:
         entries = [entry for entry in self._run(begin) if entry[0] < end]
         for k, (at, velocity) in enumerate(entries):
             until = entries[k + 1][0] if k + 1 < len(entries) else np.inf
-            until = min(until, at + COMMAND_LASTS, end)
+            until = min(until, at + COMMAND_TIMEOUT_S, end)
             total += velocity * max(until - max(at, begin), 0.0) / span
         return total
 
@@ -218,7 +219,7 @@ class _Dataset:
             if before is not None:
                 self._add(before, None)
         if not self._episodes:
-            raise UserError('a bag to export holds pictures with poses beside them',
+            raise UserError('a bag to export holds pictures with matching poses',
                             f'{bag}: {report.pictures} pictures, {report.without_pose} without a '
                             f'pose, {self._undecodable} that cannot be decoded',
                             'see `vn_nav bag doctor`')
@@ -459,7 +460,7 @@ class _Table:
 
 
 def _tasks_table(tasks: list[str]):
-    """Tasks as pandas reads them: the words are the index, for which it wants to be told so."""
+    """Tasks as pandas reads them: the text is the index, as the metadata states."""
     import pyarrow
     columns = [{'name': name, 'field_name': name, 'pandas_type': kind, 'numpy_type': numpy,
                 'metadata': None} for name, kind, numpy in (

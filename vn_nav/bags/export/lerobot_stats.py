@@ -1,4 +1,4 @@
-"""Statistics of a dataset as LeRobot wants them: of an episode exactly, merged over episodes."""
+"""Statistics of a dataset in LeRobot's format: of an episode exactly, merged over episodes."""
 
 from __future__ import annotations
 

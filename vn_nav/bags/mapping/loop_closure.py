@@ -1,10 +1,10 @@
-"""Drifting odometry of a drive, straightened where the robot saw a place again.
+"""Corrects drifting odometry by loop closures and pose-graph optimisation.
 
 Keyframes of the drive are compared with those that, by what is known of the drift so far, may show
 the same place; what their pictures say of the motion between them (`two_view`) goes into a pose
 graph (`pose_graph`) with odometry. The surest come first, and each round of closures narrows what
 the next may lie off. Against wrong closures, in this order: a motion on a plane must explain most
-matches of the features, it must lie within what odometry allows, a second closure beside it must
+matches of the features, it must lie within what odometry allows, a second closure next to it must
 say the same, and in the graph a closure loses its weight with what it contradicts.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Pictures
-from vn_nav.bags.drive import JUMP
+from vn_nav.bags.drive import ODOMETRY_JUMP_M
 from vn_nav.bags.mapping.pose_graph import (
     GATE,
     Edges,
@@ -32,38 +32,44 @@ from vn_nav.bags.mapping.pose_graph import (
     relative,
     solve,
 )
-from vn_nav.bags.mapping.same_place import PLAIN, TIGHT, together, unnoticed
+from vn_nav.bags.mapping.same_place import COMMON_VIEW_M_RAD, MIN_FEATURES, together, unnoticed
 from vn_nav.bags.mapping.two_view import Camera
-from vn_nav.bags.stamped import GAP
+from vn_nav.bags.stamped import EPISODE_GAP_S
 from vn_nav.robot import RobotSpec
 
-KEY = (0.3, math.radians(20))  # m, rad between keyframes,
-NODE = (0.5, math.radians(60))  # and between nodes of the graph
-CARRIED = (1.0, math.radians(30))  # m, rad: what odometry may lie off between two episodes
-APART = (1.0, math.pi)  # m driven or rad turned that lie between the two pictures of a closure
-REACH = (1.2, math.radians(35))  # m, rad: farther, two pictures have too little in common
-SURE = (0.4, math.radians(8))  # m, rad: standard deviations of candidates in a round,
-ROUNDS = (1, 1, 1, 2, 4, 8)  # times that
-DOUBT = (0.1, math.radians(2))  # m, rad: of what is known before, at least
-EACH = 5  # candidates of a keyframe in a round
+KEYFRAME_M_RAD = (0.3, math.radians(20))  # m, rad between keyframes,
+NODE_M_RAD = (0.5, math.radians(60))  # and between nodes of the graph
+# Standard deviations of odometry between two episodes.
+EPISODE_ODOMETRY_M_RAD = (1.0, math.radians(30))
+# Driven or turned between the two pictures of a closure.
+MIN_SEPARATION_M_RAD = (1.0, math.pi)
+# Farther apart, two pictures have too little in common.
+MAX_BASELINE_M_RAD = (1.2, math.radians(35))
+# Standard deviations of candidates in a round, times the factors in ROUNDS.
+CANDIDATE_SIGMA_M_RAD = (0.4, math.radians(8))
+ROUNDS = (1, 1, 1, 2, 4, 8)
+MIN_PRIOR_SIGMA_M_RAD = (0.1, math.radians(2))  # m, rad: of what is known before, at least
+CANDIDATES_PER_KEYFRAME = 5  # candidates of a keyframe in a round
 MATCHES, SHARE = 15, 0.45  # that must agree, and of all matches
-VAGUE = math.radians(6)  # rad: standard deviation of a heading that is not worth a closure
-ATTACHED = (0.01, 0.01, 0.006)  # m, m, rad: odometry between keyframes and their nodes
-WRONG = 4.0  # times the covariance of a closure, for what its model leaves out,
-ALIKE = 2.5  # and in the graph: closures of one place share their errors
+# A closure with a less certain heading is dropped.
+MAX_HEADING_SIGMA_RAD = math.radians(6)
+KEYFRAME_SIGMA = (0.01, 0.01, 0.006)  # m, m, rad: odometry between keyframes and their nodes
+COVARIANCE_FACTOR = 4.0  # times the covariance of a closure, for what its model leaves out,
+GRAPH_COVARIANCE_FACTOR = 2.5  # and in the graph: closures of one place share their errors
 # A turn on the spot that ends where it began shows how good odometry's heading is: at most so far
 # apart [m], so many of them, and by these factors at most it is another than expected.
 SPOT, TURNS, FACTOR = (0.15, 1.0), 10, (0.4, 2.5)
-BESIDE = 6  # keyframes between closures that support each other
-BESIDE_ODOMETRY = (0.05, 0.05, 0.02)  # m, m, rad: standard deviations of odometry on the way
+SUPPORT_KEYFRAMES = 6  # keyframes between closures that support each other
+# m, m, rad: standard deviations of the odometry between them.
+SUPPORT_ODOMETRY_SIGMA = (0.05, 0.05, 0.02)
 FEWEST = 5  # closures, or odometry stays as it is, and two stretches are no one place
-LOOKING = 0.4  # of the time, to find features
+FEATURE_TIME_SHARE = 0.4  # of the time, to find features
 
 CLOSURE = np.dtype([('first', np.int64), ('second', np.int64), ('matches', np.int64),
                     ('motion', np.float64, 3), ('chi', np.float64)])
 
 
-class Straightened(NamedTuple):
+class OptimisedOdometry(NamedTuple):
     """A drive in one frame; N pictures, K closures."""
 
     poses: np.ndarray  # [N,3] float64 x, y [m], yaw [rad]; the first is that of odometry
@@ -77,7 +83,7 @@ class Straightened(NamedTuple):
 def straighten(drives: DriveSet, robot: RobotSpec, pictures: Pictures | None = None, *,
                stretch: np.ndarray | None = None,
                show: Callable[[float], None] = lambda share: None,
-               until: float = math.inf) -> Straightened:
+               until: float = math.inf) -> OptimisedOdometry:
     """Correct the poses of a drive by the places that it shows twice.
 
     Args:
@@ -87,7 +93,7 @@ def straighten(drives: DriveSet, robot: RobotSpec, pictures: Pictures | None = N
         pictures: [N,3,S,S] uint8; default: those of the drives. 128 to 160 pixels are enough.
         stretch: [N] int64, 0 and up: between two of them odometry does not hold
             (`continuity.divide`); default: it holds throughout.
-        show: is told the share that is done.
+        show: receives the share that is done.
         until: `time.monotonic()` after which no further round of the search begins, unless
             there are several stretches.
 
@@ -95,17 +101,17 @@ def straighten(drives: DriveSet, robot: RobotSpec, pictures: Pictures | None = N
         The poses; as odometry has them where too little was recognised (`facts['corrected']`).
     """
     drive = _Drive(drives, robot, drives.image if pictures is None else pictures, stretch,
-                   lambda share: show(LOOKING * share))
+                   lambda share: show(FEATURE_TIME_SHARE * share))
     found = _Found(drive)
     solution = solve(drive.odometry[drive.node], drive.edges, found.edges())
     rounds = 0
     for loosen in ROUNDS:
         if rounds and time.monotonic() > until and not drive.stretch.any():
             break
-        done = LOOKING + (1 - LOOKING) * rounds / len(ROUNDS)
+        done = FEATURE_TIME_SHARE + (1 - FEATURE_TIME_SHARE) * rounds / len(ROUNDS)
 
         def told(share: float, done: float = done) -> None:
-            show(done + share * (1 - LOOKING) / len(ROUNDS))
+            show(done + share * (1 - FEATURE_TIME_SHARE) / len(ROUNDS))
 
         if found.search(solution, loosen, told):
             solution = found.settle(solution)
@@ -116,14 +122,14 @@ def straighten(drives: DriveSet, robot: RobotSpec, pictures: Pictures | None = N
              'rounds': rounds, 'strain': 0.0}
     own, place = found.places()
     if not facts['corrected']:
-        return Straightened(drive.odometry.copy(), np.zeros(0, CLOSURE), own, place, facts)
+        return OptimisedOdometry(drive.odometry.copy(), np.zeros(0, CLOSURE), own, place, facts)
     poses = drive.spread(solution.poses)
     off = between(drive.odometry, poses)
     strain = misfit(solution.poses, drive.edges, solution.shares)
     facts |= {'moved': float(np.hypot(off[:, 0], off[:, 1]).max()),
               'turned': float(np.abs(off[:, 2]).max()), 'strain': float(strain.max(initial=0.0)),
               'strained': int(drive.node[np.argmax(strain)]) if len(strain) else 0}
-    return Straightened(poses, found.table(solution), own, place, facts)
+    return OptimisedOdometry(poses, found.table(solution), own, place, facts)
 
 
 class _Drive:
@@ -136,13 +142,14 @@ class _Drive:
         ways = np.hypot(steps[:, 0], steps[:, 1])
         self.stretch = (np.zeros(len(self.odometry), np.int64) if stretch is None else stretch)
         carried = (np.diff(drives.episode) != 0) & (
-            (np.abs(np.diff(drives.time)) > GAP) | (ways > JUMP)) | (np.diff(self.stretch) != 0)
+            (np.abs(np.diff(drives.time)) > EPISODE_GAP_S) | (ways > ODOMETRY_JUMP_M)) | (
+                np.diff(self.stretch) != 0)
         self.way, self.turn, self.net = (  # m driven, rad turned, rad to the left, [N]
             np.append(0.0, np.cumsum(np.where(carried, 0.0, moved)))
             for moved in (ways, np.abs(steps[:, 2]), steps[:, 2]))
         part = np.append(0, np.cumsum(carried))
-        self.key = self._every(KEY, part)  # pictures [K]
-        self.node = self._every(NODE, part)  # pictures [A]
+        self.key = self._every(KEYFRAME_M_RAD, part)  # pictures [K]
+        self.node = self._every(NODE_M_RAD, part)  # pictures [A]
         self.edges = self._odometry_edges(part)
         shares, before = self._shares(self.key)
         self.near = np.minimum(before + (shares > 0.5), len(self.node) - 1)  # node of a keyframe
@@ -168,7 +175,7 @@ class _Drive:
 
     def _shares(self, pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where pictures lie from the node before them to the next, [K] in [0, 1]; that node."""
-        moved = self.way / NODE[0] + self.turn / NODE[1]
+        moved = self.way / NODE_M_RAD[0] + self.turn / NODE_M_RAD[1]
         before = np.searchsorted(self.node, pictures, side='right') - 1
         after = np.minimum(before + 1, len(self.node) - 1)
         span = moved[self.node[after]] - moved[self.node[before]]
@@ -185,7 +192,8 @@ class _Drive:
         at = self.node
         motion = between(self.odometry[at[:-1]], self.odometry[at[1:]])
         covariance = odometry_covariance(motion, np.diff(self.way[at]), np.diff(self.turn[at]))
-        covariance[np.diff(part[at]) > 0] += np.diag([CARRIED[0], CARRIED[0], CARRIED[1]])**2
+        covariance[np.diff(part[at]) > 0] += np.diag(
+            [*2 * EPISODE_ODOMETRY_M_RAD[:1], EPISODE_ODOMETRY_M_RAD[1]])**2
         first = np.arange(len(at) - 1)
         return Edges(first, first + 1, 0 * motion, 0 * motion, motion, covariance)
 
@@ -221,7 +229,7 @@ class _Found:
         return self._edges(self.closures)
 
     def table(self, solution: Solution) -> np.ndarray:
-        """What is kept, as `Straightened.closures`."""
+        """What is kept, as `OptimisedOdometry.closures`."""
         kept = [self.closures[k] for k in np.flatnonzero(self.kept)]
         out = np.zeros(len(kept), CLOSURE)
         for field in ('matches', 'motion'):
@@ -232,7 +240,7 @@ class _Found:
         return out
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """`stretch` and `place` of `Straightened`."""
+        """`stretch` and `place` of `OptimisedOdometry`."""
         drive, stretch = self._drive, self._drive.stretch.copy()
         first, second, recognised = np.array(self._alike, np.int64).reshape(-1, 3).T
         own = stretch[drive.key[first]] == stretch[drive.key[second]]
@@ -270,7 +278,8 @@ class _Found:
         while True:  # at each turn there are fewer
             kept = edges.take(self.kept)
             solution = solve(
-                solution.poses, odometry, kept._replace(covariance=ALIKE * kept.covariance),
+                solution.poses, odometry,
+                kept._replace(covariance=GRAPH_COVARIANCE_FACTOR * kept.covariance),
                 self._drive.features[0].scale, solution.shares)
             wrong = solution.chi > GATE
             if not wrong.any():
@@ -314,42 +323,46 @@ class _Found:
         place = covariance[:, 0, :, 0] + covariance[:, 1, :, 1]
         heading = covariance[:, 2, :, 2]
         for i in range(1, len(poses)):
-            past = np.flatnonzero((way[i] - way[:i] > APART[0]) | (turn[i] - turn[:i] > APART[1]))
+            past = np.flatnonzero((way[i] - way[:i] > MIN_SEPARATION_M_RAD[0])
+                                  | (turn[i] - turn[:i] > MIN_SEPARATION_M_RAD[1]))
             gap = between(poses[past], poses[i])
             metres, angle = np.hypot(gap[:, 0], gap[:, 1]), np.abs(gap[:, 2])
             a, b = drive.near[past], drive.near[i]
             off, twist = (np.sqrt(np.maximum(v[a, a] + v[b, b] - 2 * v[a, b], 0.0))
                           for v in (place, heading))
-            good = ((off < SURE[0] * loosen) & (twist < SURE[1] * loosen)
-                    & (metres < REACH[0] + off) & (angle < REACH[1] + twist))
-            cost = (metres / 0.5)**2 + (angle / KEY[1])**2
+            good = ((off < CANDIDATE_SIGMA_M_RAD[0] * loosen)
+                    & (twist < CANDIDATE_SIGMA_M_RAD[1] * loosen)
+                    & (metres < MAX_BASELINE_M_RAD[0] + off)
+                    & (angle < MAX_BASELINE_M_RAD[1] + twist))
+            cost = (metres / 0.5)**2 + (angle / KEYFRAME_M_RAD[1])**2
             order = [k for k in np.flatnonzero(good)[np.argsort(cost[good])]
                      if (int(past[k]), i) not in self.tested]
-            for k in order[:EACH]:
+            for k in order[:CANDIDATES_PER_KEYFRAME]:
                 yield (int(past[k]), i), float(off[k]), float(twist[k])
 
     def _tight(self, pair: tuple[int, int], expected: np.ndarray, place: float, heading: float
                ) -> bool:
         """Whether two pictures must look alike, see `same_place.unnoticed`."""
-        return (math.hypot(*expected[:2]) + place < TIGHT[0]
-                and abs(expected[2]) + heading < TIGHT[1]
-                and min(len(self._drive.features[k].slope) for k in pair) >= PLAIN)
+        return (math.hypot(*expected[:2]) + place < COMMON_VIEW_M_RAD[0]
+                and abs(expected[2]) + heading < COMMON_VIEW_M_RAD[1]
+                and min(len(self._drive.features[k].slope) for k in pair) >= MIN_FEATURES)
 
     def _compare(self, first: int, second: int, expected: np.ndarray, place: float,
                  heading: float) -> _Closure | None:
         one, other = self._drive.features[first], self._drive.features[second]
         seen = self._drive.camera.relate(
-            one, other, expected, math.hypot(place, DOUBT[0]), math.hypot(heading, DOUBT[1]))
+            one, other, expected, math.hypot(place, MIN_PRIOR_SIGMA_M_RAD[0]),
+            math.hypot(heading, MIN_PRIOR_SIGMA_M_RAD[1]))
         if (seen is None or seen.matches < max(MATCHES, SHARE * seen.tried)
-                or seen.covariance[2, 2] > VAGUE**2):
+                or seen.covariance[2, 2] > MAX_HEADING_SIGMA_RAD**2):
             return None
         # By the longer of the two: a motion must not weigh more for being seen too short.
         length = math.hypot(*seen.motion[:2])
         along = np.append(seen.motion[:2], 0.0) / max(length, 1e-9) * max(
             length, math.hypot(*expected[:2]))
         covariance = (seen.covariance + one.scale**2 * np.outer(along, along)
-                      + np.diag(ATTACHED)**2)
-        return _Closure(first, second, seen.matches, seen.motion, WRONG * covariance)
+                      + np.diag(KEYFRAME_SIGMA)**2)
+        return _Closure(first, second, seen.matches, seen.motion, COVARIANCE_FACTOR * covariance)
 
     def _supported(self, edges: Edges, among: np.ndarray) -> np.ndarray:
         """Which closures another one of `among` [K] beside them supports, [K] bool."""
@@ -359,10 +372,10 @@ class _Found:
         out = np.zeros(len(order), bool)
         for step in range(1, len(order)):
             k, m = order[:-step], order[step:]
-            close = first[m] - first[k] <= BESIDE
+            close = first[m] - first[k] <= SUPPORT_KEYFRAMES
             if not close.any():
                 break
-            close &= (np.abs(second[m] - second[k]) <= BESIDE) & among[k] & among[m]
+            close &= (np.abs(second[m] - second[k]) <= SUPPORT_KEYFRAMES) & among[k] & among[m]
             k, m = k[close], m[close]
             to = between(odometry[first[k]], odometry[first[m]])
             back = between(odometry[second[m]], odometry[second[k]])
@@ -370,7 +383,7 @@ class _Found:
             error[:, 2] = wrap_angle(error[:, 2])
             c, s, zero = np.cos(to[:, 2]), np.sin(to[:, 2]), np.zeros(len(to))
             turned = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1], 1).reshape(-1, 3, 3)
-            spread = (edges.covariance[k] + np.diag(BESIDE_ODOMETRY)**2
+            spread = (edges.covariance[k] + np.diag(SUPPORT_ODOMETRY_SIGMA)**2
                       + turned @ edges.covariance[m] @ turned.transpose(0, 2, 1))
             agree = chi_squared(error, spread) < GATE
             out[k[agree]] = out[m[agree]] = True

@@ -12,13 +12,13 @@ import numpy as np
 
 from vn_nav.bags.continuity import Break, divide, find_breaks
 from vn_nav.bags.dataset import DriveSet
-from vn_nav.bags.mapping.loop_closure import Straightened
+from vn_nav.bags.mapping.loop_closure import OptimisedOdometry
 from vn_nav.bags.mapping.pose_graph import GATE
 from vn_nav.errors import UserError
 
 RANGES = re.compile(r'\d+-\d+(,\d+-\d+)*')
 LISTED = 6  # stretches in an error, at most
-RULE = 'a place is learned from a drive in one frame, or from stretches that show one place'
+RULE = 'place recognition is learned from a drive in one frame, or from stretches of one place'
 
 
 class Rows:
@@ -115,7 +115,7 @@ def check_frame(part: Part) -> None:
                 ', or leave out --no-straighten: pictures may show that they are one place')
 
 
-def check_place(part: Part, found: Straightened) -> None:
+def check_place(part: Part, found: OptimisedOdometry) -> None:
     """Refuse what pictures do not show to be one place.
 
     Raises:
@@ -128,16 +128,16 @@ def check_place(part: Part, found: Straightened) -> None:
         begins = np.flatnonzero(np.diff(found.stretch)) + 1
         hidden = [k for k in begins if part.stretch[k] == part.stretch[k - 1]]
         for k in hidden:
-            reasons.insert(found.stretch[k], 'no picture from here on shows what the drive saw '
-                           'before from the same poses')
+            reasons.insert(found.stretch[k], 'from here on no picture matches the earlier '
+                           'pictures at the same poses')
         _refuse(part, found.stretch, found.place, reasons, '')
     if found.facts['strain'] > GATE:
         k = found.facts['strained']
         raise UserError(
-            'odometry and what the robot saw again agree', f'they contradict each other after '
+            'odometry agrees with the loop closures', f'they contradict each other after '
             f'picture {part.rows[k] + 1} ({_clock(part, k)}): poses would move by up to '
             f'{found.facts["moved"]:.1f} m', 'learn from the drive before or after it with '
-            f'--pictures 1-{part.rows[k] + 1}, or take odometry as it is with --no-straighten')
+            f'--pictures 1-{part.rows[k] + 1}, or use odometry unchanged with --no-straighten')
 
 
 def _refuse(part: Part, stretch: np.ndarray, place: np.ndarray, reasons: Sequence[str],

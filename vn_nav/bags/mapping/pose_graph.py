@@ -1,7 +1,7 @@
 """Poses on a floor that agree best with odometry and with what was recognised: a pose graph.
 
 Odometry may count all ways or all turns too long, and pictures, which see distances only as far as
-depths are known, all motions: these three shares are unknowns beside the poses.
+depths are known, all motions: these three shares are unknowns in addition to the poses.
 Wrong measurements do not pull: their weight falls with what they contradict, at first hardly
 (graduated non-convexity: Yang, Antonante, Tzoumas and Carlone, "Graduated Non-Convexity for Robust
 Spatial Perception", 2020, with Geman and McClure's kernel).
@@ -19,8 +19,8 @@ GATE = 16.3  # chi^2 of a measurement, 3 degrees of freedom, 99.9 %
 WAYS, TURNS = 0.02, 0.01  # standard deviations of the shares of odometry
 ODOMETRY = np.array([[1, 0, 0], [1, 0, 0], [0, 1.0, 0]])  # which share acts on x, y and yaw
 CLOSURES = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])
-HELD = 1e9  # information that holds the first pose
-SETTLED = 1e-4  # m or rad: steps below end the search
+FIRST_POSE_INFORMATION = 1e9  # information that holds the first pose
+MIN_STEP = 1e-4  # m or rad: steps below end the search
 
 
 class Edges(NamedTuple):
@@ -74,7 +74,7 @@ def solve(poses: np.ndarray, odometry: Edges, closures: Edges, scale: float = 0.
 
     Args:
         poses: [A,3] to begin with; the first stays.
-        odometry: from each node to the next; is believed.
+        odometry: from each node to the next; is not tested.
         closures: the others; may be wrong.
         scale: standard deviation of the share of closures.
         shares: [3] to begin with.
@@ -90,7 +90,7 @@ def solve(poses: np.ndarray, odometry: Edges, closures: Edges, scale: float = 0.
         poses = poses + step[:-3].reshape(-1, 3)
         shares = shares + step[-3:]
         chi = _errors(poses, closures, CLOSURES @ shares)[1]
-        if wide == 1.0 and np.abs(step).max() < SETTLED:
+        if wide == 1.0 and np.abs(step).max() < MIN_STEP:
             break
         wide = max(1.0, wide / 1.6)
     poses[:, 2] = wrap_angle(poses[:, 2])
@@ -176,7 +176,7 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
         left = by_shares.transpose(0, 2, 1) @ inverse
         down[size:] -= (left @ error[..., None])[..., 0].sum(axis=0)
         information[size:, size:] += (left @ by_shares).sum(axis=0)
-    blocks[0, :, 0] += HELD * np.eye(3)
+    blocks[0, :, 0] += FIRST_POSE_INFORMATION * np.eye(3)
     information[:size, :size] = blocks.reshape(size, size)
     information[:size, size:] = beside.reshape(size, 3)
     information[size:, :size] = information[:size, size:].T

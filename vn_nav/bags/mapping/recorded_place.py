@@ -21,7 +21,7 @@ from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 
 GOALS, LEAST_GOALS = 1000, 4
-LOOKED_AT = 128  # pixels a side of the pictures that places are recognised by
+PLACE_PICTURE_PX = 128  # pixels a side of the pictures that places are recognised by
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +60,7 @@ def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: R
         robot: that drove, with the policy's actions.
         size: side of the pictures [pixels].
         cache: folder of decoded bags.
-        show: is told what is done, and the share of it that is.
+        show: receives the current step and its share done.
         until: see `loops.straighten`.
 
     Raises:
@@ -87,7 +87,7 @@ def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: R
     stretch = part.stretch
     if options.straighten:
         # Larger pictures than the network's tell more exactly where they were taken.
-        large = load(LOOKED_AT) if size < LOOKED_AT else drives
+        large = load(PLACE_PICTURE_PX) if size < PLACE_PICTURE_PX else drives
         found = straighten(part.of(large), robot, stretch=stretch, until=until,
                            show=lambda share: show('places seen again', share))
         check_place(part, found)
@@ -105,7 +105,7 @@ def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: R
 
 
 def _episodes(part: Part) -> np.ndarray:
-    """[K] numbers of what nobody drove in between: episodes, and stretches of odometry."""
+    """[K] numbers of independent parts: episodes, and stretches of odometry."""
     anew = (np.diff(part.drives.episode) != 0) | (np.diff(part.stretch) != 0)
     return np.append(0, np.cumsum(anew))
 
@@ -114,21 +114,21 @@ def _say(facts: dict, stretches: int, vouched: bool) -> None:
     """How odometry was corrected."""
     if stretches > 1:
         print(f'{stretches} stretches that odometry does not connect: '
-              + ('taken for one frame, as --pictures says' if vouched else
+              + ('taken for one frame, as --pictures states' if vouched else
                  'pictures show that they are of one place'), flush=True)
     if facts['corrected']:
-        print(f'odometry is straightened: {facts["closures"]:,} times the robot saw a place '
+        print(f'odometry is corrected: {facts["closures"]:,} times the robot saw a place '
               f'again; poses moved by up to {facts["moved"]:.2f} m and '
               f'{math.degrees(facts["turned"]):.0f} deg', flush=True)
     else:
-        print('odometry stays as it is: too few places are recognised when seen again', flush=True)
+        print('odometry is not corrected: too few loop closures', flush=True)
     if facts['rounds'] < len(ROUNDS):
-        print(f'the search for them ended after round {facts["rounds"]} of {len(ROUNDS)}, for '
-              'lack of time', flush=True)
+        print(f'the search for loop closures ended after round {facts["rounds"]} of '
+              f'{len(ROUNDS)}: time limit', flush=True)
 
 
 def scene_of(bag: Path) -> dict:
-    """What a simulator said of the scene of a bag; empty: nobody did."""
+    """The message on `scene` in a bag; empty: there is none."""
     first = next(messages(bag, ('scene',)), None)
     try:
         said = json.loads(first.message.data) if first is not None else {}

@@ -13,11 +13,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 # A pair of pictures that must look alike: by all that is known no farther apart than these.
-TIGHT = (0.6, math.radians(20))  # m, rad
-PLAIN = 40  # features: with fewer a picture may be of a wall
+COMMON_VIEW_M_RAD = (0.6, math.radians(20))  # m, rad
+MIN_FEATURES = 40  # features: with fewer a picture may be of a wall
 # So many such pairs, none recognised, are no chance: of a sound drive 80 to 95 % are recognised,
 # and where it is cut in two anywhere at most 4 lead across without any that is.
-NEVER = 12
+MIN_UNMATCHED_PAIRS = 12
 
 
 def together(count: int, pairs: Iterable[Sequence[int]], least: int) -> np.ndarray:
@@ -57,4 +57,4 @@ def unnoticed(first: np.ndarray, second: np.ndarray, recognised: np.ndarray) -> 
         return np.cumsum(begin - end)[cuts]
     wrong = np.where(across(recognised) == 0, across(~recognised), 0)
     best = int(np.argmax(wrong))
-    return int(cuts[best]) if wrong[best] >= NEVER else None
+    return int(cuts[best]) if wrong[best] >= MIN_UNMATCHED_PAIRS else None

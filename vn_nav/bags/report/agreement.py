@@ -1,4 +1,4 @@
-"""What a policy would have done on a recorded drive, beside what was done.
+"""What a policy would have done on a recorded drive, compared with what was done.
 
 The policy is shown the pictures at which the robot's actions began, one after the other as its
 memory wants them, and is told what was done, not what it would have done: each of its answers is
@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import MISFIT
+from vn_nav.bags.drive import NO_ACTION
 from vn_nav.bags.roles import Topics
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:  # it takes torch along
     from vn_nav.policy.checkpoint import LoadedCheckpoint
 
-LISTED = 300  # steps that are told one by one, at most
+LISTED = 300  # steps that are listed, at most
 SHOWN = 8  # disagreements with their pictures
 STOP, OTHER, END = 'stop', 'fits none', 'episode ends'
 
@@ -128,24 +128,24 @@ def _episode(drives: DriveSet, steps: slice, goal: np.ndarray, checkpoint: Loade
 
     from vn_nav.policy.runtime import BatchedPolicy
     policy, actions = BatchedPolicy(checkpoint.network, 1, 'greedy'), checkpoint.config.actions
-    goals, before = np.array(goal)[None], MISFIT
+    goals, before = np.array(goal)[None], NO_ACTION
     for row in range(steps.start, steps.stop):
         # After a motion that is none of its actions the memory is emptied, as in pre-training.
         observation = {'image': np.array(drives.image[row])[None],
                        'goal_index': np.zeros(1, np.int64),
                        'last_action': np.array([before], np.int64),
                        'last_reward': np.zeros(1, np.float32)}
-        best = int(policy.act(observation, goals, np.array([before == MISFIT]))[0])
+        best = int(policy.act(observation, goals, np.array([before == NO_ACTION]))[0])
         assert policy.logits is not None  # it has just acted
         sure = torch.softmax(policy.logits[0].float(), -1).numpy()
         before = int(drives.action[row])
-        done = (actions[before] if before != MISFIT
+        done = (actions[before] if before != NO_ACTION
                 else END if row == steps.stop - 1 else OTHER)
         arrived = threshold is not None and float(policy.arrival[0]) > threshold
         yield Judged(int(drives.episode[row]), row - steps.start, done,
                      STOP if arrived else actions[best],
                      float(policy.arrival[0]) if arrived else float(sure[best]),
-                     float(sure[before]) if before != MISFIT else math.nan)
+                     float(sure[before]) if before != NO_ACTION else math.nan)
 
 
 def _keep_worst(worst: list[Disagreement], new: Disagreement) -> None:

@@ -10,16 +10,16 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_rgb
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.doctor.figures import NOISE
+from vn_nav.bags.doctor.figures import ODOMETRY_NOISE_M_RAD
 from vn_nav.bags.drive import Frame
 
-BINS = 240  # stretches of time, at most
-STRIP = 12  # pictures of the film strip, and goal pictures, at most
-HEIGHT = 132  # pixels of a thumbnail
-POINTS = 4000  # of the path, at most
-SPACING = 0.02  # m between points of the path
-PROGRESS = 0.1  # m and rad added, between two pictures that might be shown
-ANEW = 0.5  # the same, for a new episode: it begins elsewhere
+MAX_BINS = 240  # stretches of time, at most
+MAX_STRIP_PICTURES = 12  # pictures of the film strip, and goal pictures, at most
+THUMBNAIL_PX = 132  # pixels of a thumbnail
+MAX_PATH_POINTS = 4000  # of the path, at most
+PATH_SPACING_M = 0.02  # m between points of the path
+MIN_PROGRESS_M_RAD = 0.1  # m and rad added, between two pictures that might be shown
+EPISODE_PROGRESS_M_RAD = 0.5  # the same, for a new episode: it begins elsewhere
 
 
 class Timeline:
@@ -36,7 +36,7 @@ class Timeline:
     def __init__(self, width: float):
         self.origin: int | None = None
         self._end, self._width = 0, round(width * 1e9)
-        self._rows: dict[str, np.ndarray] = {}  # [BINS,4] count, sum, lowest, highest
+        self._rows: dict[str, np.ndarray] = {}  # [MAX_BINS,4] count, sum, lowest, highest
 
     @property
     def width(self) -> float:
@@ -46,17 +46,17 @@ class Timeline:
         """Note a number of a kind at a time [ns]."""
         self.origin = at if self.origin is None else self.origin
         self._end = max(self._end, at - self.origin)
-        while self._end >= BINS * self._width:
+        while self._end >= MAX_BINS * self._width:
             self._double()
-        rows = self._rows.setdefault(name, _empty(BINS))
+        rows = self._rows.setdefault(name, _empty(MAX_BINS))
         row = rows[max(at - self.origin, 0) // self._width]
         row[:] = row[0] + 1, row[1] + value, min(row[2], value), max(row[3], value)
 
     def _double(self) -> None:
         self._width *= 2
         for name, rows in self._rows.items():
-            pairs, merged = rows.reshape(-1, 2, 4), _empty(BINS)
-            merged[:BINS // 2] = np.concatenate([
+            pairs, merged = rows.reshape(-1, 2, 4), _empty(MAX_BINS)
+            merged[:MAX_BINS // 2] = np.concatenate([
                 pairs[..., :2].sum(1), pairs[..., 2:3].min(1), pairs[..., 3:].max(1)], 1)
             self._rows[name] = merged
 
@@ -64,12 +64,12 @@ class Timeline:
         """Centres of the stretches since the origin [K] s, and numbers a second in each [K]."""
         whole = max(int(self._end // self._width), 1)  # the last one is not over
         seconds = self.width if self._end >= self._width else max(self._end * 1e-9, 1e-3)
-        return self._centres(whole), self._rows.get(name, _empty(BINS))[:whole, 0] / seconds
+        return self._centres(whole), self._rows.get(name, _empty(MAX_BINS))[:whole, 0] / seconds
 
     def values(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """The same centres [K], and [K,3] mean, lowest and highest number; nan where is none."""
         used = int(self._end // self._width) + 1
-        rows = self._rows.get(name, _empty(BINS))[:used]
+        rows = self._rows.get(name, _empty(MAX_BINS))[:used]
         known = rows[:, :1] > 0
         mean = rows[:, 1:2] / np.maximum(rows[:, :1], 1)
         return self._centres(used), np.where(known, np.concatenate([mean, rows[:, 2:]], 1), np.nan)
@@ -94,12 +94,12 @@ class Odometer:
     def go(self, frame: Frame) -> None:
         """Take the next frame."""
         if self._last is None or frame.episode != self._last.episode:
-            self.progress += ANEW * (self._last is not None)
+            self.progress += EPISODE_PROGRESS_M_RAD * (self._last is not None)
             self._last = frame
             return
         metres = math.dist(frame.pose[:2], self._last.pose[:2])
         turned = abs(wrap_angle(frame.pose[2] - self._last.pose[2]))
-        if metres + turned >= NOISE:
+        if metres + turned >= ODOMETRY_NOISE_M_RAD:
             self.metres, self.turned = self.metres + metres, self.turned + turned
             self.progress += metres + turned
             self._last = frame
@@ -109,7 +109,7 @@ class Odometer:
 class Shot:
     """A picture of the film strip."""
 
-    progress: float  # m and rad, and `ANEW` an episode, since the beginning
+    progress: float  # m and rad, and `EPISODE_PROGRESS_M_RAD` an episode, since the beginning
     time: float  # s of recording
     episode: int
     pose: np.ndarray  # [3] x, y [m], yaw [rad]
@@ -121,7 +121,7 @@ class Film:
 
     def __init__(self):
         self._shots: list[Shot] = []
-        self._stride, self._last = PROGRESS, None
+        self._stride, self._last = MIN_PROGRESS_M_RAD, None
         self.undecodable = 0
 
     def add(self, frame: Frame, progress: float) -> None:
@@ -130,7 +130,7 @@ class Film:
         if self._shots and progress < self._shots[-1].progress + self._stride:
             return
         self._take(frame, progress)
-        if len(self._shots) >= 4 * STRIP:
+        if len(self._shots) >= 4 * MAX_STRIP_PICTURES:
             self._stride *= 2
             kept = self._shots[:1]
             for shot in self._shots[1:]:
@@ -139,14 +139,14 @@ class Film:
             self._shots = kept
 
     def shots(self) -> list[Shot]:
-        """At most `STRIP` of them, in order: the first, the last and what lies between."""
+        """At most `MAX_STRIP_PICTURES` in order, with the first and the last."""
         if self._last is not None and self._shots and self._last[1] > self._shots[-1].progress:
             self._take(*self._last)
         way = np.array([shot.progress for shot in self._shots])
         if not len(way):
             return []
         chosen = {int(np.abs(way - wanted).argmin())
-                  for wanted in np.linspace(way[0], way[-1], STRIP)}
+                  for wanted in np.linspace(way[0], way[-1], MAX_STRIP_PICTURES)}
         return [self._shots[k] for k in sorted(chosen)]
 
     def _take(self, frame: Frame, progress: float) -> None:
@@ -161,7 +161,7 @@ class Goals:
     """The goal pictures that were shown."""
 
     def __init__(self):
-        self.shown: list[tuple[int, np.ndarray]] = []  # first episode, [H,W,3]; `STRIP` at most
+        self.shown: list[tuple[int, np.ndarray]] = []  # first episode, [H,W,3]
         self.count = 0
         self._last = None
 
@@ -174,7 +174,7 @@ class Goals:
             return
         self._last = stamp
         self.count += 1
-        if len(self.shown) < STRIP:
+        if len(self.shown) < MAX_STRIP_PICTURES:
             picture = thumbnail(frame.goal)
             if picture is not None:
                 self.shown.append((frame.episode, picture))
@@ -185,7 +185,7 @@ class Ways:
 
     def __init__(self):
         self._ways: dict[int, list[np.ndarray]] = {}
-        self._spacing, self._points, self._most = SPACING, 0, POINTS
+        self._spacing, self._points, self._most = PATH_SPACING_M, 0, MAX_PATH_POINTS
         self._last: Frame | None = None
 
     def add(self, frame: Frame) -> None:
@@ -195,7 +195,7 @@ class Ways:
         self._last = frame
         way = self._ways.get(frame.episode)
         if way is None:
-            if self._points < POINTS:  # there may be more episodes than points
+            if self._points < MAX_PATH_POINTS:  # there may be more episodes than points
                 self._ways[frame.episode] = [frame.pose]
                 self._points += 1
         elif math.dist(way[-1][:2], frame.pose[:2]) >= self._spacing:
@@ -229,17 +229,17 @@ class Ways:
                 kept.append(way[-1])
             self._ways[episode] = kept
         self._points = sum(map(len, self._ways.values()))
-        self._most = max(POINTS, self._points + POINTS // 4)  # many episodes have many ends
+        self._most = max(MAX_PATH_POINTS, self._points + MAX_PATH_POINTS // 4)
 
 
 def thumbnail(message) -> np.ndarray | None:
     """A small picture [H,W,3] uint8 of an image message; None: it cannot be decoded."""
     try:
-        picture = decode_rgb(message, HEIGHT)
+        picture = decode_rgb(message, THUMBNAIL_PX)
     except ImageError:
         return None
     height, width = picture.shape[:2]
-    size = max(round(width * HEIGHT / height), 1), HEIGHT
-    if height <= HEIGHT:
+    size = max(round(width * THUMBNAIL_PX / height), 1), THUMBNAIL_PX
+    if height <= THUMBNAIL_PX:
         return picture
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -10,14 +10,14 @@ import numpy as np
 
 from vn_nav import __version__
 from vn_nav.bags.doctor.figures import ERROR, Finding, TopicFigures
-from vn_nav.bags.drive import COARSE, COMMAND_LASTS
+from vn_nav.bags.drive import ACTION_LENGTH_TOLERANCE, COMMAND_TIMEOUT_S
 from vn_nav.bags.report.agreement import END, OTHER, STOP, Agreement, Disagreement, Judged
-from vn_nav.bags.report.figures import STRIP, Shot, Timeline
+from vn_nav.bags.report.figures import MAX_STRIP_PICTURES, Shot, Timeline
 from vn_nav.bags.report.show import AXES, Shown
 from vn_nav.report.chart import Line, Series, Shape, Text, legend, panel, ticks, to_svg
 from vn_nav.report.page import CURVES, cards, page, picture, table
 
-TOPICS = 60  # told one by one, at most
+TOPICS = 60  # listed, at most
 MAP = 620, 470  # pixels
 MARGIN = 0.4  # m around the path, and the least it is drawn wide
 MOVING = 0.02  # m/s or rad/s: below that an axis is not drawn
@@ -100,7 +100,8 @@ def _film(shown: Shown) -> str:
     asked = (f'<h3>Goal pictures{more}</h3><div class="strip wrap film">{goals}</div>'
              if goals else '')
     return f"""<h2>What it saw</h2><div class="strip wrap film">{figures}</div>
-<p class="soft">At most {STRIP} pictures, evenly along the way; the map has their numbers.</p>
+<p class="soft">At most {MAX_STRIP_PICTURES} pictures, evenly along the
+way; the map has their numbers.</p>
 {asked}"""
 
 
@@ -131,8 +132,8 @@ def _map(shown: Shown) -> str:
                Text(20 + unit * scale, base + 4, f'{unit:g} m', 'start', 'ink')]
     by = ('by odometry' if shown.topics.odometry else 'by the commands alone, which drift: there '
           'is no odometry')
-    colours = (f'a colour an episode (again after {CURVES})' if shown.report.episodes > CURVES
-               else 'a colour an episode' if shown.report.episodes > 1 else '')
+    colours = (f'one colour per episode (again after {CURVES})' if shown.report.episodes > CURVES
+               else 'one colour per episode' if shown.report.episodes > 1 else '')
     return f"""<figure>{to_svg(shapes, width, height, 'map of the path')}<figcaption>The path
 {by}{", " * bool(colours)}{colours}. Dot: start; ring: end; numbers: pictures of the film strip,
 with the direction the robot faced.</figcaption></figure>"""
@@ -193,7 +194,8 @@ def _actions(shown: Shown) -> str:
                    Text(end + 6, y + 16, f'{count:,} ({count / max(total, 1):.0%})')]
     return f"""<figure>{to_svg(shapes, width, height, 'actions')}<figcaption>The drive, cut into
 the actions of the robot {html.escape(shown.robot.name)}. An action counts if its length is right
-to {COARSE:.0%} and little else is done beside it; the rest fits none.</figcaption></figure>"""
+to {ACTION_LENGTH_TOLERANCE:.0%} and there is little motion along other axes; the rest
+matches no action.</figcaption></figure>"""
 
 
 def _velocities(velocities: Timeline, moved: float) -> str:
@@ -221,7 +223,7 @@ def _velocities(velocities: Timeline, moved: float) -> str:
     still = ' The odometry reports no velocities, though its poses move.' if silent else ''
     return f"""<figure>{to_svg(shapes, width, top, 'velocities over time')}<figcaption>Means over
 {velocities.width:g} s, with the lowest and highest value in between. Without a command for
-{COMMAND_LASTS:g} s nothing is commanded.{still}</figcaption></figure>"""
+{COMMAND_TIMEOUT_S:g} s nothing is commanded.{still}</figcaption></figure>"""
 
 
 def _reach(values: list[np.ndarray]) -> tuple[float, float]:
@@ -245,7 +247,7 @@ def _series(kind: str, times: np.ndarray, values: np.ndarray, width: float) -> S
         for k in range(len(values)):
             since = 0.0 if heard[k] else since + width
             if not heard[k]:
-                values[k] = values[k - 1] if since <= COMMAND_LASTS else 0.0
+                values[k] = values[k - 1] if since <= COMMAND_TIMEOUT_S else 0.0
     else:
         times, values = times[heard], values[heard]
     return Series(kind, _kind_colour(kind), times, values[:, 0], values[:, 1], values[:, 2],
@@ -287,18 +289,18 @@ def _spark(times: np.ndarray, rate: np.ndarray, name: str) -> str:
 
 def _policy(agreement: Agreement, checkpoint: str) -> str:
     episodes = ('' if not agreement.hindsight else f' In {agreement.hindsight} '
-                f'episode{"s" * (agreement.hindsight != 1)} no goal was shown: the last picture '
-                'stands in for it.')
-    stop = (' <i>stop</i>: it would have said that it has arrived.'
+                f'episode{"s" * (agreement.hindsight != 1)} no goal was published: the last '
+                'picture is used as the goal.')
+    stop = (' <i>stop</i>: it would have declared arrival.'
             if STOP in agreement.columns else '')
-    sure = ('' if math.isnan(agreement.done_sure) else f' It gave the actions that were done a '
+    sure = ('' if math.isnan(agreement.done_sure) else f' It gave the executed actions a '
             f'probability of {agreement.done_sure:.0%} on average.')
     return f"""<h2>What the policy would have done</h2>
-<p>{html.escape(checkpoint)} saw the pictures at which actions began, and was told what was
-done.{sure}{episodes}</p>
+<p>{html.escape(checkpoint)} received the pictures at which actions began, and the executed
+actions.{sure}{episodes}</p>
 <div class="pair"><div>{_confusion(agreement)}<p class="soft">Rows: what was done; columns: the
-action that the policy prefers.{stop} Where it acts by chance it does not always do what it
-prefers.</p></div><div>{_steps(agreement)}</div></div>
+action that the policy prefers.{stop} With sampled decoding it does not always take
+the action it prefers.</p></div><div>{_steps(agreement)}</div></div>
 {_worst(agreement.worst)}"""
 
 

@@ -18,7 +18,7 @@ from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.doctor.figures import Diagnosis
 from vn_nav.bags.drive import (
-    Cutter,
+    ActionSegmenter,
     Frame,
     Report,
     TimestampedMessage,
@@ -34,13 +34,13 @@ from vn_nav.robot import RobotSpec
 if TYPE_CHECKING:  # it takes torch along
     from vn_nav.policy.checkpoint import LoadedCheckpoint
 
-RATES, VELOCITIES = 0.5, 0.05  # s: the shortest stretch that either is told of
+RATES, VELOCITIES = 0.5, 0.05  # s: the shortest interval of either
 AXES = ('vx', 'vy', 'wz')
 
 
 @dataclasses.dataclass
 class Shown:
-    """All that the page tells. K points of a path, L stretches of time."""
+    """The content of the page. K points of a path, L stretches of time."""
 
     diagnosis: Diagnosis
     start: float  # s since 1970, of the first message
@@ -87,7 +87,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
             yield frame
 
     frames = synchronise(_heard(bag, names, velocities), names, report)
-    for _ in Cutter(robot, report).cut(watched(frames)):
+    for _ in ActionSegmenter(robot, report).cut(watched(frames)):
         pass
     assert rates.origin is not None  # a camera was found: there are messages
     shown = Shown(diagnosis, rates.origin * 1e-9, names, rates, velocities, way.ways(),
@@ -106,7 +106,7 @@ def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[Tim
                 velocity = (twist_to_array(m.message)[:3] if kind == 'commanded'
                             else odometry_to_array(m.message)[3:6])
             except MotionError:
-                pass  # the doctor has told of it
+                pass  # the doctor reports it
             else:
                 for axis, value in zip(AXES, velocity, strict=True):
                     velocities.add(f'{kind} {axis}', round(m.time * 1e9), float(value))

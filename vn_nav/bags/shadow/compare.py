@@ -17,7 +17,7 @@ from vn_nav.bags.storage.stream import messages
 from vn_nav.errors import UserError
 
 ARRIVED = 'arrived'
-LISTED = 5  # longest disagreements that are told
+LISTED = 5  # longest disagreements that are listed
 
 
 class Answer(NamedTuple):

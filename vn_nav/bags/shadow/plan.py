@@ -21,18 +21,19 @@ import numpy as np
 from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.dataset import Wanted, read_steps
-from vn_nav.bags.drive import MISFIT, Report, find_topics
+from vn_nav.bags.drive import NO_ACTION, Report, find_topics
 from vn_nav.bags.roles import COMPRESSED, Topics, full_name
 from vn_nav.bags.storage.decoding import Decoder
 from vn_nav.bags.storage.stream import Bag, summary
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 
-RATES = 5.0, 20.0  # Hz of commands
-SAMPLE = 400  # messages that tell the rate
-LATEST = (1 << 31) * 10**9  # ns, of what a header can say
-GAP = 1_000_000  # ns between an episode's first picture and the last one, where a clock went back
-RESOLUTION = 1_000  # ns; stamps as float64 s since 1970 are a quarter of that apart
+COMMAND_RATES_HZ = 5.0, 20.0  # Hz of commands
+RATE_SAMPLE_MESSAGES = 400  # messages from which the rate is measured
+MAX_STAMP_NS = (1 << 31) * 10**9  # the largest header stamp
+# Between the last picture and the next episode's first one, where a clock went back.
+CLOCK_RESET_GAP_NS = 1_000_000
+STAMP_RESOLUTION_NS = 1_000  # ns; stamps as float64 s since 1970 are a quarter of that apart
 
 
 class Decision(NamedTuple):
@@ -169,11 +170,11 @@ class _Clock:
     def picture(self, log_time: int, stamp: int, wanted: bool) -> int | None:
         """The stamp of a picture; None: it comes again, or too late, and may be left out."""
         stamp = (stamp or log_time) + self._shift
-        if self._picture is not None and stamp < self._picture + RESOLUTION:
+        if self._picture is not None and stamp < self._picture + STAMP_RESOLUTION_NS:
             if not wanted:
                 return None
-            self._shift += self._picture + GAP - stamp
-            stamp = self._picture + GAP
+            self._shift += self._picture + CLOCK_RESET_GAP_NS - stamp
+            stamp = self._picture + CLOCK_RESET_GAP_NS
         self._picture, self._log_time = stamp, log_time
         return stamp
 
@@ -215,7 +216,7 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
         _check_times(bag, int(frame.time * 1e9), int(frame.stamp * 1e9))
         first = not decisions or decisions[-1].episode != frame.episode
         decisions.append(Decision(frame.time, frame.episode, None if first else done, step.last))
-        done = None if step.action == MISFIT else robot.action_names[step.action]
+        done = None if step.action == NO_ACTION else robot.action_names[step.action]
         if step.last:
             goals.keep(frame.episode, frame.goal, frame.image)
     if len({decision.time for decision in decisions}) < len(decisions):
@@ -223,7 +224,7 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
                         f"{bag}: the recorder's clock was set back", 'record each take into a '
                         'bag of its own')
     if not decisions:
-        raise UserError('a bag to drive along holds pictures with poses beside them',
+        raise UserError('a bag for shadow mode holds pictures with matching poses',
                         f'{bag}: {report.pictures} pictures, {report.without_pose} without a '
                         'pose', 'see `vn_nav bag doctor`')
     return Plan(Path(bag), found, full_name(summary(bag)[found.image].type) == COMPRESSED,
@@ -241,10 +242,13 @@ def _rate(bag: str | Path, topic: str) -> float:
     """Ticks a second that a topic allows."""
     decode = Decoder()
     stamps = [decode.header_stamp(message) or message.log_time
-              for message in itertools.islice(Bag(bag).in_time_order((topic,)), SAMPLE)]
+              for message in itertools.islice(
+                  Bag(bag).in_time_order((topic,)), RATE_SAMPLE_MESSAGES)]
     gaps = np.diff(stamps)
     gaps = gaps[gaps > 0]
-    return float(np.clip(1e9 / np.median(gaps), *RATES)) if len(gaps) else RATES[1]
+    if not len(gaps):
+        return COMMAND_RATES_HZ[1]
+    return float(np.clip(1e9 / np.median(gaps), *COMMAND_RATES_HZ))
 
 
 def _first(bag: str | Path, topic: str) -> bytes:
@@ -260,7 +264,7 @@ def _is_finite(message: object) -> bool:
 
 
 def _check_times(bag: str | Path, *times: int) -> None:
-    if not all(0 <= time < LATEST for time in times):
+    if not all(0 <= time < MAX_STAMP_NS for time in times):
         raise UserError('a drive is stamped from 1970 to 2038', f'{bag}: {max(times)} ns',
                         'see `vn_nav bag doctor`')
 

@@ -57,7 +57,7 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
     """The files of a bag: as its metadata.yaml has them, or by their numbers.
 
     Whatever in the folder is a recording by its name or its first bytes is read or refused; hidden
-    files, and folders within, are nobody's concern. A file whose twin without the last ending lies
+    files, and folders within, are ignored. A file whose twin without the last ending lies
     beside it (unpacked, or finished) is read by the twin, as `ros2 bag play` leaves them.
 
     Args:
@@ -87,7 +87,7 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
                   and (fault := _fault(path / name)) is not None}
         folders = [name for name in names if (path / name).is_dir()]
     except OSError as error:
-        raise BagError(path, f'cannot be looked into ({error.strerror})', rule=A_BAG,
+        raise BagError(path, f'cannot be opened ({error.strerror})', rule=A_BAG,
                        remedy='give the path of a recording') from error
     there = [file for name in names if (file := path / name) not in faults
              and file.suffix.lower() == '.mcap']
@@ -136,7 +136,7 @@ def _fault(path: Path) -> tuple[str, str] | None:
     if path.is_dir():
         return 'is a folder', 'move it elsewhere, or give its own path'
     if not path.is_file():
-        return 'is no file', 'give the path of a recording'
+        return 'is not a file', 'give the path of a recording'
     try:
         with open(path, 'rb') as file:
             return None if file.read(1) else (EMPTY, 'copy it again, or take it away')
@@ -173,7 +173,7 @@ def load_yaml(text: str) -> Any:
 
     Raises:
         ValueError: what takes quadratic or exponential time to read, and no bag needs.
-        Exception: many others; the text is nobody's to vouch for.
+        Exception: many others; the text is untrusted.
     """
     depth = deepest = 0
     for bracket in re.findall(r'[][{}]', text):
@@ -198,10 +198,10 @@ def _listed(folder: Path, names: list[str]) -> tuple[dict, list[Path]]:
         raise
     except Exception as error:  # no end to what YAML can be instead
         raise BagError(path, f'is not the metadata of a bag ({type(error).__name__})',
-                       remedy='take it away: the MCAP files tell all that is in it') from error
+                       remedy='take it away: the MCAP files hold all of its content') from error
     for name in listed:
         if Path(name).name != name or name in ('', '..'):
-            raise BagError(path, f'it names {name!r}, which is not within the folder',
+            raise BagError(path, f'it names {name!r}, which is outside the folder',
                            remedy='correct relative_file_paths')
     anew = f'write the bag anew with {converted(folder, names)}'
     if mode == 'message':

@@ -57,7 +57,7 @@ def unpacked(body: bytes) -> tuple[bytes, ChunkHead]:
     if left < 0:
         raise Damage(f'a chunk declares {head.stored} bytes and has {left + head.stored}')
     if left >= HEAD.size and begins_record(body[-left:]):
-        raise Damage('a chunk goes on behind its records, over other records of the file')
+        raise Damage('a chunk extends beyond its records, over other records of the file')
     return unpack(memoryview(body)[head.at:head.at + head.stored], head), head
 
 
@@ -88,7 +88,7 @@ def unpack(stored: memoryview, head: ChunkHead) -> bytes:
 def _inflate(stored: memoryview, compression: str, size: int) -> bytes:
     """The `size` bytes that a chunk declares; never takes memory for more.
 
-    They may be in several frames; what is behind these is nobody's.
+    They may be in several frames; what follows them is not part of it.
     """
     if compression == '':
         return bytes(stored)

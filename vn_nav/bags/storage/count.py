@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from vn_nav.bags.storage.records import Declared
 
-TOLD = 3  # channels that are named
+MAX_NAMED_CHANNELS = 3  # channels that are named
 
 
 class Count(NamedTuple):
@@ -57,8 +57,9 @@ def _difference(differing: Mapping[str, tuple[int, int]]) -> Count:
     apart = {name: pair for name, pair in differing.items() if pair[0] != pair[1]}
     words = [f'it counts {counted} messages{name}, and {read} were read'
              for name, (counted, read) in apart.items()]
-    if len(words) > TOLD:
-        words[TOLD:] = [f'and so with {len(words) - TOLD} other channels']
+    if len(words) > MAX_NAMED_CHANNELS:
+        words[MAX_NAMED_CHANNELS:] = [
+            f'and so with {len(words) - MAX_NAMED_CHANNELS} other channels']
     return Count(sum(max(counted - read, 0) for counted, read in apart.values()),
                  sum(max(read - counted, 0) for counted, read in apart.values()),
                  ('; '.join(words),) if words else ())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vn_nav.bags.storage.salvage import Gap
 
-MAX_LOSSES = 1000  # that are told one by one
+MAX_LOSSES = 1000  # that are listed
 
 
 @dataclasses.dataclass

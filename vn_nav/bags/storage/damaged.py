@@ -40,7 +40,7 @@ from vn_nav.bags.storage.records import (
     Message,
 )
 from vn_nav.bags.storage.salvage import Gap, declare, mistaken, salvaged, swallowed
-from vn_nav.bags.storage.summary import MAGIC, WINDOW, Summary, crc_of, peek
+from vn_nav.bags.storage.summary import MAGIC, READ_BYTES, Summary, crc_of, peek
 
 CANDIDATE = 256  # bytes of patience that a place costs which only looks like a record
 _CHUNK_START = re.compile(rb'\x06.{7}\0.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)', re.DOTALL)
@@ -87,7 +87,7 @@ class DamagedFile:
                 opcode, length = self._kind(at, trusted)
                 if opcode == DATA_END and length == _MARK or opcode == FOOTER and length == 20:
                     if self._ended and at + HEAD.size + length < self._limit:
-                        raise Damage('the data end before their end')
+                        raise Damage('the data section ends too early')
                     break
                 end = yield from self._record(at, opcode, length, trusted)
                 if self.crc is not None:
@@ -258,14 +258,14 @@ class DamagedFile:
             return known
         patterns = (_CHUNK_START, MESSAGE_START, DECLARATION_START)[:1 if self._chunked else 3]
         while at < self._limit and self._patience > 0:
-            data = self._peek(at, WINDOW)
+            data = self._peek(at, READ_BYTES)
             found = min((place for pattern in patterns if (
                 place := self._first(pattern, data, at)) is not None), default=None)
             if found is not None:
                 return found
-            if len(data) < WINDOW:
+            if len(data) < READ_BYTES:
                 break
-            at += WINDOW - 64  # a pattern may lie across the edge
+            at += READ_BYTES - 64  # a pattern may lie across the edge
         return self._limit
 
     def _first(self, pattern: re.Pattern, data: bytes, base: int) -> int | None:

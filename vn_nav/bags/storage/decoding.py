@@ -1,7 +1,7 @@
 """Serialised messages to objects, by the definitions that a bag brings along.
 
 `rosbags` generates Python code from definitions and runs it on the messages. Both come from a file
-that nobody vouches for: a definition is checked before it becomes code, and a message before it
+that is untrusted: a definition is checked before it becomes code, and a message before it
 becomes objects.
 """
 

@@ -173,7 +173,7 @@ class McapFile:
                     crc = None if crc is None else zlib.crc32(record, crc)
                     yield from records(record, declared)
                 elif opcode in (DATA_END, FOOTER):
-                    raise Damage('the data end before their end')
+                    raise Damage('the data section ends too early')
                 elif crc is not None:
                     crc = crc_of(file, at, end - at, crc)
                 at = end

@@ -1,4 +1,4 @@
-"""What publishers sent and nobody heard."""
+"""Messages that were published and not received."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Losses:
     REMEMBERED = 16
 
     def __init__(self):
-        self._last: list[int] = []  # number of each publisher; the one heard last at the end
+        self._last: list[int] = []  # number of each publisher; the latest at the end
 
     def hear(self, number: int, publishers: int) -> int:
         """Messages lost before this one.

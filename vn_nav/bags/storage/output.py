@@ -40,7 +40,7 @@ CHUNK = 256 * 1024  # bytes of records, or one message if that is larger
 LEVEL = 1  # of zstd
 MAGIC = b'\x89MCAP0\r\n'
 MESSAGE_HEAD = 31  # bytes of a message's record before its data
-KEPT = 512  # parts in memory, at least: what a full disk may take back at once
+MIN_PARTS_IN_MEMORY = 512  # parts in memory, at least: what a full disk may take back at once
 
 
 class _Part(NamedTuple):
@@ -65,7 +65,7 @@ class _Parts:
         self._folder = folder
         self._file: IO[bytes] | None = None
         self._last: list[_Part] = [_Part()]
-        self._blocks: list[tuple[int, int]] = []  # place and size of each `KEPT` before these
+        self._blocks: list[tuple[int, int]] = []  # place, size of earlier parts
 
     @property
     def last(self) -> _Part:
@@ -73,9 +73,10 @@ class _Parts:
 
     def push(self, part: _Part) -> None:
         self._last.append(part)
-        if len(self._last) < 2 * KEPT:
+        if len(self._last) < 2 * MIN_PARTS_IN_MEMORY:
             return
-        block = zlib.compress(pickle.dumps([tuple(part) for part in self._last[:KEPT]]), 1)
+        block = zlib.compress(pickle.dumps(
+            [tuple(part) for part in self._last[:MIN_PARTS_IN_MEMORY]]), 1)
         place = sum(self._blocks[-1]) if self._blocks else 0
         try:
             if self._file is None:
@@ -85,7 +86,7 @@ class _Parts:
         except OSError:  # a full disk, which the bag itself meets next; they stay in memory
             return
         self._blocks.append((place, len(block)))
-        del self._last[:KEPT]
+        del self._last[:MIN_PARTS_IN_MEMORY]
 
     def pop(self) -> _Part:
         part = self._last.pop()

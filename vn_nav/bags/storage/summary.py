@@ -34,7 +34,7 @@ from vn_nav.bags.storage.records import (
 )
 
 MAGIC = b'\x89MCAP0\r\n'
-WINDOW = 1 << 20  # bytes that are read at a time
+READ_BYTES = 1 << 20  # bytes that are read at a time
 MAX_SETS = 1 << 16  # sets of channels, and numbers in them, that are told apart
 _NEVER = (0, HEADER, FOOTER, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
 _FOOTER = struct.Struct('<BQQQI')  # head, start of the summary, of its offsets, CRC
@@ -70,7 +70,7 @@ class Chunks:
         number = self._numbers.get(held)
         if number is None:
             self._members += len(held)
-            number = 0  # as if nobody knew: such a chunk is always read
+            number = 0  # as if unknown: such a chunk is always read
             if len(self._numbers) < MAX_SETS and self._members <= MAX_SETS:
                 number = self._numbers[held] = len(self._numbers)
         self._offsets.append(offset)
@@ -225,7 +225,7 @@ def crc_of(file: BinaryIO, start: int, size: int, crc: int = 0) -> int:
     """The checksum of a stretch of a file, behind one that has `crc`."""
     file.seek(start)
     while size > 0:
-        data = file.read(min(size, WINDOW))
+        data = file.read(min(size, READ_BYTES))
         if not data:
             raise Damage('the file became shorter while it was read')
         crc, size = zlib.crc32(data, crc), size - len(data)

@@ -21,10 +21,11 @@ from vn_nav.bags.storage.definitions import definition
 from vn_nav.bags.storage.output import CHUNK, McapOutput
 from vn_nav.errors import UserError
 
-FLUSH = 1.0  # s between flushes: what a power cut may cost
-MIN_FREE = 1_000_000_000  # bytes
-WAITING = 64 << 20  # bytes that may wait for the disk before `write` does
-SOON = 0.1  # s to the flush after the first message of a topic: metadata.yaml is to name it
+FLUSH_PERIOD_S = 1.0  # s between flushes: what a power cut may cost
+MIN_FREE_BYTES = 1_000_000_000  # bytes
+MAX_WAITING_BYTES = 64 << 20  # bytes that may wait for the disk before `write` does
+# To the flush after the first message of a topic, so that metadata.yaml names it.
+FIRST_FLUSH_S = 0.1
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}  # as Jazzy writes a duration without end
 
 
@@ -84,7 +85,7 @@ class BagWriter:
     """
 
     def __init__(self, folder: str | Path, topics: Iterable[Topic] = (), *, max_bytes: int = 0,
-                 max_seconds: float = 0.0, min_free: int = MIN_FREE):
+                 max_seconds: float = 0.0, min_free: int = MIN_FREE_BYTES):
         self.folder = Path(folder)
         self._max_bytes, self._max_seconds, self._min_free = max_bytes, max_seconds, min_free
         self.stopped = ''  # why, in words
@@ -121,7 +122,7 @@ class BagWriter:
         """Take another topic; one of the same name is written with this type from now on.
 
         Raises:
-            UserError: nobody knows its type.
+            UserError: its type is unknown.
         """
         name = topic.name if topic.name.startswith('/') else f'/{topic.name}'
         self._added[topic.name] = _Channel(name, topic, *definition(topic.type))
@@ -142,7 +143,7 @@ class BagWriter:
             raise ValueError(f'a stamp is nanoseconds since 1970; received {stamp}')
         item = _Waiting(self._added[name], data, stamp, sequence)
         with self._change:
-            while self._bytes > WAITING and not self.stopped:
+            while self._bytes > MAX_WAITING_BYTES and not self.stopped:
                 self._change.wait()
             if self.stopped:
                 raise RecordingStopped(self.folder, self.stopped)
@@ -175,7 +176,7 @@ class BagWriter:
 
     def _work(self) -> None:
         """The thread: never raises."""
-        self._due, told = time.monotonic() + FLUSH, 0
+        self._due, told = time.monotonic() + FLUSH_PERIOD_S, 0
         try:
             while (item := self._take(self._due)) or not self._closing:
                 if item:
@@ -187,7 +188,7 @@ class BagWriter:
                     self._check_room()
                     if told != (told := self.written.total()):
                         self._write_metadata()
-                    self._due = time.monotonic() + FLUSH
+                    self._due = time.monotonic() + FLUSH_PERIOD_S
             self._present.flush()
         except Exception as error:  # also a bug must not leave writers waiting for ever
             self._stop(error)
@@ -232,7 +233,7 @@ class BagWriter:
                 channel.name, channel.topic.type, channel.definition,
                 {'offered_qos_profiles': _yaml([_quality(channel.topic)]),
                  'topic_type_hash': channel.digest})
-            self._due = min(self._due, time.monotonic() + SOON)
+            self._due = min(self._due, time.monotonic() + FIRST_FLUSH_S)
         self._present.add(self._channels[channel], item.data, item.stamp, item.sequence)
 
     def _stop(self, error: Exception) -> None:
