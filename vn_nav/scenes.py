@@ -45,7 +45,7 @@ def parse_scene(text: str) -> SceneName:
     place, question, options = rest.partition('?')
     if not (colon and place and _SIMULATOR.fullmatch(simulator)):
         raise UserError(rule, text, EXAMPLE)
-    pairs = []
+    pairs: list[tuple[str, str]] = []
     for part in options.split('&') if question else ():
         found = _OPTION.fullmatch(part)
         if not found or found[1] in dict(pairs):

@@ -25,12 +25,21 @@ class NavigationVectorEnv(Protocol):
     """
 
     num_envs: int  # N
-    action_names: Sequence[str]
     robot: RobotSpec
     goals: Any  # [G,3,S,S] uint8, array or tensor
-    world_version: str  # of the simulator
-    simulator_name: str  # as scenes name it
     restorable: bool  # `get_state` and `set_state` are there and work
+
+    @property
+    def action_names(self) -> Sequence[str]:
+        """Of the actions, in order."""
+
+    @property
+    def world_version(self) -> str:
+        """Of the simulator."""
+
+    @property
+    def simulator_name(self) -> str:
+        """As scenes name the simulator."""
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Begin new episodes: observations and info."""

@@ -45,7 +45,9 @@ class Placed(NamedTuple):
 class Distance(Protocol):
     """How far it is to one goal, for a robot that has to drive there."""
 
-    maximum: float  # the largest distance of the place [m]
+    @property
+    def maximum(self) -> float:
+        """The largest distance of the place [m]."""
 
     def at(self, poses: np.ndarray) -> np.ndarray:
         """Of poses [K,>=2] to the goal, [K] m; inf where there is no way."""
@@ -71,8 +73,13 @@ class Place(Protocol):
     `obstacle_rects`; with `capabilities.rooms` `rooms`. A `House` has all of it.
     """
 
-    name: str  # of its scene: 'house:7', 'bag:my_drive'
-    goals: Sequence[Goal]
+    @property
+    def name(self) -> str:
+        """Of its scene: 'house:7', 'bag:my_drive'."""
+
+    @property
+    def goals(self) -> Sequence[Goal]:
+        """Where goal pictures are taken."""
 
     def starts(self) -> tuple[np.ndarray, np.ndarray | None]:
         """Where episodes may begin: positions [K,2] m, headings [K] rad; None: any heading."""
@@ -165,14 +172,29 @@ class Simulator(Protocol):
 
     num_envs: int
     version: str  # of pixels, places and motion; figures of another version mean nothing here
-    label_names: Sequence[str]  # behind the class ids
-    places: Sequence[Place]
     capabilities: Capabilities
-    poses: np.ndarray  # [N,4]; read alone
-    place_index: np.ndarray  # [N] the place of each robot
-    seen_from: np.ndarray  # [N,4] poses that the last pictures were taken from
     objects: Objects
     planner: Planner | None  # None: a robot can turn anywhere, so distances will do
+
+    @property
+    def label_names(self) -> Sequence[str]:
+        """Behind the class ids."""
+
+    @property
+    def places(self) -> Sequence[Place]:
+        """Of its scenes."""
+
+    @property
+    def poses(self) -> np.ndarray:
+        """[N,4] x, y [m], yaw, pitch [rad]; read alone."""
+
+    @property
+    def place_index(self) -> np.ndarray:
+        """[N] the place of each robot."""
+
+    @property
+    def seen_from(self) -> np.ndarray:
+        """[N,4] poses that the last pictures were taken from."""
 
     def enter(self, env_ids: np.ndarray, places: np.ndarray) -> None:
         """Put robots [K] into places [K]; their poses are still to be set."""
@@ -249,6 +271,7 @@ class BaseSimulator:
     label_names: Sequence[str] = ()
     splits: ClassVar[Mapping[str, Sequence[str]]] = {}  # names of scenes by the split's name
     planner: Planner | None = None
+    places: Sequence[Place]
 
     @classmethod
     def open(cls, scenes: Sequence[SceneName], setup: Setup) -> Simulator:

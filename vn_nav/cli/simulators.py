@@ -13,7 +13,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """It has none."""
 
 
-
 def run(args: argparse.Namespace) -> int:
     """`vn_nav simulators`: what there is, what each can do, what is missing here."""
     from vn_sim_bridge.simulators import missing, simulator_class, table

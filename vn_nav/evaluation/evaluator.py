@@ -45,7 +45,7 @@ def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: i
     """
     count = env.num_envs
     each = -(-episodes // count)
-    durations = np.array([*(robot.with_actions(env.action_names).nominal_duration(a)
+    durations = np.array([*(robot.with_actions(tuple(env.action_names)).nominal_duration(a)
                             for a in range(len(env.action_names))), 0.0])  # declaring: no time
     poses = _goal_poses(env)
     found: list[list[Episode]] = [[] for _ in range(count)]

@@ -41,7 +41,7 @@ looks at its picture falls far behind here.</dd></dl>"""
 
 
 def evaluation_page(result: dict, measured: dict[str, Rows],
-                    plans: dict[str, dict[str, dict]], *, maps: int = MAPS) -> str:
+                    plans: dict[str, dict[str, dict | None]], *, maps: int = MAPS) -> str:
     """The page.
 
     Args:
@@ -75,8 +75,8 @@ def _split(name: str, split: dict, rows: Rows, plans: dict[str, dict | None], re
         f'In the pictures of the drive {html.escape(bag)}')
     own = next(iter(split['rows'][headline].values()))
     chosen = choose(next(iter(rows[headline].values())), maps)
-    figures = ''.join(_map(episode, plans[episode.scene], limit, bag) for episode in chosen
-                      if plans[episode.scene] is not None)
+    figures = ''.join(_map(episode, plan, limit, bag) for episode in chosen
+                      if (plan := plans[episode.scene]) is not None)
     legend = ('<p class="soft">Dot: start; ring: end; blue arrow: the goal and where its picture '
               'looks; crosses: contacts.</p>' if chosen else '')
     return f"""<h2>{html.escape(SPLITS.get(name, name))}</h2>

@@ -560,8 +560,8 @@ class WarpNavigationEnv:
         task = tasks.ImageGoal(self.places, self.num_envs, min_distance=config.min_start_distance)
         self.goal_rooms = tuple(view.name for view in task.views)
         self.goal_poses = np.array([view.pose for view in task.views])
-        scenes = [house.scene for house in self.places]
-        self.renderer = WarpRenderer(scenes, config.size, self.num_envs, device=device)
+        drawn = [house.scene for house in self.places]
+        self.renderer = WarpRenderer(drawn, config.size, self.num_envs, device=device)
         self._houses = self._upload_houses(task)
         self._rules = self._make_rules()
         self._robots = self._make_robots()

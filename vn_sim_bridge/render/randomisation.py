@@ -103,8 +103,8 @@ class Appearance(NamedTuple):
     blur: np.ndarray  # [K] float32, share of the width
 
 
-def draw_appearance(config: Randomisation, rooms: int, seed: int, stream: Stream, env,
-                    episode) -> Appearance:
+def draw_appearance(config: Randomisation, rooms: int, seed: int | np.ndarray, stream: Stream,
+                    env, episode) -> Appearance:
     """Light and camera of some episodes.
 
     Args:

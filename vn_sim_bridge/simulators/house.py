@@ -82,6 +82,7 @@ class HouseSimulator(BaseSimulator):
     capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True,
                                 rooms=True, walls=True, placeable_objects=True, appearance=True,
                                 other_goals=True)
+    places: list[House]
     version = WORLD_VERSION
     label_names = LABELS
     splits = {name: ScenesBySeed(seeds) for name, seeds in SPLITS.items()}
@@ -111,9 +112,8 @@ class HouseSimulator(BaseSimulator):
                                      *map(object_scene, models)], size, threads=threads)
         self.objects = no_objects(self.num_envs, objects)
         self._all = np.arange(self.num_envs)
-        self._frames = None
-        self._appearance = None
-        self.apply_appearance(self._all, 0, Stream.APPEARANCE, self._all, 0 * self._all)
+        self._frames: Frames | None = None
+        self._appearance = self.appearance(0, Stream.APPEARANCE, self._all, 0 * self._all)
 
     @property
     def poses(self) -> np.ndarray:
@@ -133,7 +133,7 @@ class HouseSimulator(BaseSimulator):
         """Where a translation of `length` [m] along each heading [rad] would end, [K,2] m."""
         return self.world.reach(env_id, headings, length)
 
-    def appearance(self, seed: int, stream: Stream, env, episode) -> Appearance:
+    def appearance(self, seed: int | np.ndarray, stream: Stream, env, episode) -> Appearance:
         """Light and camera of some episodes, or of some goal pictures."""
         return draw_appearance(self.randomisation, self._renderer.rooms, seed, stream, env,
                                episode)
@@ -142,9 +142,6 @@ class HouseSimulator(BaseSimulator):
                          env, episode) -> None:
         """Draw light and camera of robots [K] anew, for the counters [K] of their episodes."""
         drawn = self.appearance(seed, stream, env, episode)
-        if self._appearance is None:
-            self._appearance = drawn
-            return
         for part, rows in zip(self._appearance, drawn, strict=True):
             part[env_ids] = rows
 
