@@ -114,10 +114,11 @@ def test_the_bridges_own_account_agrees(demo):
 
 def test_the_control_without_ros_is_shown_the_goal_pictures_of_the_bag(demo):
     checkpoint = load_checkpoint(share_file('models/house'))
-    for place, (drive, house, limit) in zip(
-            ('trained', 'unseen'), zip(drives_from_bag(demo / 'bag', pictures=True), (7, 8),
-                                       (300, 100), strict=True), strict=True):
-        env = control_env(make_env, checkpoint, house, len(drive.episodes), limit)
+    for place, (drive, scene, limit) in zip(
+            ('trained', 'unseen'), zip(drives_from_bag(demo / 'bag', pictures=True),
+                                       ('house:7', 'house:8'), (300, 100), strict=True),
+            strict=True):
+        env = control_env(make_env, checkpoint, scene, len(drive.episodes), limit)
         seen, info = env.reset(seed=SEED)
         for k, recorded in enumerate(drive.episodes):
             np.testing.assert_array_equal(recorded.goal_picture.transpose(2, 0, 1),
