@@ -23,6 +23,7 @@ from rclpy.utilities import remove_ros_args
 from vn_nav.errors import UserError
 from vn_nav.nodes import signals
 from vn_nav.nodes.parameters import help_lines
+from vn_nav.nodes.shared_memory import remove_dead_segments
 from vn_nav.nodes.signals import Ended
 
 __all__ = ['Ended', 'compiling', 'run_node', 'spin']
@@ -76,6 +77,7 @@ def run_node(name: str, make: Callable[[Ended], AnyNode],
                 if own:
                     raise UserError('arguments of a node stand after --ros-args', ' '.join(own),
                                     'see --help')
+                remove_dead_segments()
                 # rclpy's own handlers would close the context before the last message is out.
                 rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
             node = make(ended)
