@@ -54,6 +54,48 @@ class NavigationVectorEnv(Protocol):
         """Let go of everything; a second time it does nothing."""
 
 
+# What some environments have beside, asked of them with isinstance.
+
+
+@runtime_checkable
+class RestorableEnv(Protocol):
+    """Of an environment that is `restorable`."""
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything that changes from step to step, as arrays."""
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Stand where `get_state` was taken."""
+
+
+@runtime_checkable
+class RecallingEnv(Protocol):
+    """Does not know its goals before it has seen them, as `RosEnv`."""
+
+    @property
+    def shown_goals(self) -> Any:
+        """The goal pictures seen so far [G,3,S,S] uint8."""
+
+    def recall_goals(self, pictures: Any) -> None:
+        """Number goals as an earlier environment did; before `reset`."""
+
+
+@runtime_checkable
+class PlacedEnv(Protocol):
+    """Knows which place each robot is in."""
+
+    @property
+    def place_index(self) -> Any:
+        """[N], array or tensor."""
+
+
+@runtime_checkable
+class GoalLabelsEnv(Protocol):
+    """Knows what its goal pictures show."""
+
+    goal_segmentation: Any  # [G,S,S] uint8, array or tensor
+
+
 @runtime_checkable
 class MeasuredVectorEnv(NavigationVectorEnv, Protocol):
     """What an evaluation needs beside.

@@ -13,6 +13,7 @@ from vn_msgs_py import motion
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
 from vn_nav.scenes import parse_scene
+from vn_sim_bridge.floor.places import with_rooms
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.robot import lidar
 from vn_sim_bridge.robot.odometry import Uncertainty
@@ -161,7 +162,7 @@ def scene_facts(robot: SimulatedRobot) -> dict:
         'scene': place.name,
         'simulator': parse_scene(place.name).simulator,
         'world_version': simulator.version,
-        **({'rooms': len(place.rooms)} if simulator.capabilities.rooms else {}),
+        **({'rooms': len(with_rooms(place).rooms)} if simulator.capabilities.rooms else {}),
         **(place.plan() or {}),
         'goals': [{'room': field.goal.room, 'pose': list(field.goal.pose)}
                   for field in robot.fields],

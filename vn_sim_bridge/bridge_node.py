@@ -21,6 +21,7 @@ from rclpy.clock import Clock as NodeClock
 from rclpy.clock import ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, LaserScan
 from std_msgs.msg import Bool, Float32, String, UInt8
@@ -89,11 +90,13 @@ class SimBridgeNode(Node):
         self.command_count = 0
         self.unanswered = False  # lock-step: nobody has sent a command for a while
         self.rest_ticks = 0  # since it came to rest
-        self.next_goal = None  # pose from the goal_pose topic, for the next reset
+        # Pose from the goal_pose topic, for the next reset.
+        self.next_goal: tuple[float, float, float] | None = None
         self.done = False
         self.says_arrived = self.goal_taken = False  # the policy, in this episode
         self.goal_shown = 0.0  # steady time [s]
-        self._clock, self._clock_from = None, created + DISCOVERY
+        self._clock_publisher: Publisher | None = None  # made once nobody else has one
+        self._time_from = created + DISCOVERY
         self._make_interfaces(values)
         with compiling(self, ended, work):
             self.begin(0)
@@ -115,7 +118,7 @@ class SimBridgeNode(Node):
         names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
                  for info in self.get_publishers_info_by_topic(self.resolve_topic_name(CLOCK))]
         # Two bridges may have one name: a name is this node's once, and only when it publishes.
-        if self._clock is not None and (me := self.get_fully_qualified_name()) in names:
+        if self._clock_publisher is not None and (me := self.get_fully_qualified_name()) in names:
             names.remove(me)
         return sorted(set(names))
 
@@ -125,15 +128,15 @@ class SimBridgeNode(Node):
         Raises:
             UserError: somebody else does: this node, the newcomer, ends.
         """
-        if self._clock is None:
-            if time.monotonic() < self._clock_from:
+        if self._clock_publisher is None:
+            if time.monotonic() < self._time_from:
                 return
             if others := self._other_clocks():
                 raise UserError('one node alone publishes the simulated time',
                                 f'{", ".join(others)} on {self.resolve_topic_name(CLOCK)}',
                                 OWN_CLOCK)
-            self._clock = self.create_publisher(Clock, CLOCK, offered('/clock'))
-        self._clock.publish(Clock(clock=stamp))
+            self._clock_publisher = self.create_publisher(Clock, CLOCK, offered('/clock'))
+        self._clock_publisher.publish(Clock(clock=stamp))
 
     def _make_interfaces(self, values: dict) -> None:
         def publisher(kind, name):
@@ -163,9 +166,9 @@ class SimBridgeNode(Node):
             self._episode_end = publisher(UInt8, 'episode_end')
             self._episode = publisher(String, 'episode')
             self._episode_result = publisher(String, 'episode_result')
+        self._command_type = TwistStamped if values['enable_stamped_cmd_vel'] else Twist
         self._listener = self.create_subscription(
-            TwistStamped if values['enable_stamped_cmd_vel'] else Twist, 'cmd_vel',
-            self._on_command, qos('cmd_vel'))
+            self._command_type, 'cmd_vel', self._on_command, qos('cmd_vel'))
         self.create_subscription(PoseStamped, 'goal_pose', self._on_goal_pose, qos('goal_pose'))
         if self.robot.stop_rule == 'declared':
             # Deeper than the contract: what is said of one goal and of the next are both heard.
@@ -266,6 +269,7 @@ class SimBridgeNode(Node):
 
     def _goal_picture(self) -> np.ndarray:
         """The picture [H,W,3] of the episode's goal."""
+        assert self.robot.episode is not None  # one has just begun
         goal = self.robot.episode.goal
         if self.goals and goal >= 0:
             return self.goals[goal].picture
@@ -318,6 +322,7 @@ class SimBridgeNode(Node):
         if not decision.end:
             return False
         episode = self.robot.episode
+        assert episode is not None  # a decision ends one
         self._episode_result.publish(String(data=json.dumps(
             bridge_messages.result_facts(episode, decision))))
         self._episode_end.publish(UInt8(data=decision.end))
@@ -364,10 +369,10 @@ class SimBridgeNode(Node):
 
     def _misunderstandings(self) -> str:
         """Another clock, or commands of the type that this base does not read."""
-        if self._clock is not None and (others := self._other_clocks()):
-            return (f'{", ".join(others)} also publishes on {self._clock.topic_name}: time jumps; '
-                    f'{OWN_CLOCK}')
-        mine = f'geometry_msgs/msg/{self._listener.msg_type.__name__}'
+        if self._clock_publisher is not None and (others := self._other_clocks()):
+            return (f'{", ".join(others)} also publishes on {self._clock_publisher.topic_name}: '
+                    f'time jumps; {OWN_CLOCK}')
+        mine = f'geometry_msgs/msg/{self._command_type.__name__}'
         for info in self.get_publishers_info_by_topic(self._listener.topic_name):
             if info.topic_type != mine:
                 other = str(mine == 'geometry_msgs/msg/Twist').lower()

@@ -13,6 +13,7 @@ import numpy as np
 from vn_msgs_py import camera, images, motion
 from vn_sim_bridge import bridge_messages
 from vn_sim_bridge.bridge_messages import Frames, Transform
+from vn_sim_bridge.floor.places import walled
 from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
 from vn_sim_bridge.simulator import Capabilities
 
@@ -79,7 +80,7 @@ class Sensors:
         """Publish a scan, if somebody listens."""
         if self._listened('scan'):
             message = bridge_messages.fill_scan(
-                self._make('scan'), self._robot.place.obstacle_rects, self._robot.pose,
+                self._make('scan'), walled(self._robot.place).obstacle_rects, self._robot.pose,
                 self._period)
             self._publish('scan', message, stamp, self._frames.lidar)
 

@@ -69,8 +69,8 @@ class StraightDistance:
 class Place(Protocol):
     """Somewhere a robot can be: a house, a recorded drive, a level of a game.
 
-    With `capabilities.walls` a place also has `floor` (a `FloorMap`), `obstacles` and
-    `obstacle_rects`; with `capabilities.rooms` `rooms`. A `House` has all of it.
+    With `capabilities.walls` a place is also a `WalledPlace`, with `capabilities.rooms` a
+    `RoomPlace` (see `floor.places`). A `House` is all of it.
     """
 
     @property

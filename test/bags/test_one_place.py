@@ -101,7 +101,7 @@ def part(*lengths, vouched=False):
 
 def straightened(own, place, **facts):
     return OptimisedOdometry(np.zeros((len(own), 3)), None, np.array(own), np.array(place),
-                        {'strain': 0.0, 'moved': 10.0, 'strained': 99} | facts)
+                             {'strain': 0.0, 'moved': 10.0, 'strained': 99} | facts)
 
 
 def test_several_places_are_refused_with_the_stretches_and_how_to_take_one():

@@ -135,11 +135,13 @@ class PolicyActor:
                                   self.known)
         actions = self.policy.act(observation, self.env.goals, reset, scene)
         declares = np.zeros(len(actions), bool)
-        if self.env.declare_action is not None:
+        declare = self.env.declare_action
+        if declare is not None:
             declares = self.policy.arrival > self.threshold
         if self.policy.filtered is not None:
             self.filtered = np.stack(self.policy.filtered) & ~declares
-        return np.where(declares, self.env.declare_action, actions) if declares.any() else actions
+        return actions if declare is None or not declares.any() else np.where(
+            declares, declare, actions)
 
     @property
     def knows_arrival(self) -> bool:

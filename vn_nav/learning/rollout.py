@@ -23,7 +23,7 @@ from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import GoalMaps, Policy
 from vn_nav.policy.zhu import check_scenes
 from vn_nav.policy.zhu_policy import ScenePolicy
-from vn_nav.vector_env import NavigationVectorEnv
+from vn_nav.vector_env import NavigationVectorEnv, PlacedEnv
 
 
 @dataclasses.dataclass
@@ -237,6 +237,9 @@ class Collector:
         # Never encoded again: not by the learner either.
         seen.extras['features'][t] = self.network.look(seen.image[t])
         if self._scenes > 1:
+            if not isinstance(self.env, PlacedEnv):
+                raise UserError('layers for several scenes need to know which scene a robot is in',
+                                type(self.env).__name__, 'train with scenes=1')
             scene = self.env.place_index
             if self.on_device:
                 scene = scene.cpu().numpy()  # a wait that only these networks pay for

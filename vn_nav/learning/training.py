@@ -32,7 +32,7 @@ from vn_nav.learning.training_state import initial_weights, restore, state_of
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.resnet import load_frozen_weights
 from vn_nav.policy.zhu_policy import ScenePolicy, build_policy
-from vn_nav.vector_env import NavigationVectorEnv
+from vn_nav.vector_env import GoalLabelsEnv, NavigationVectorEnv
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
@@ -101,6 +101,13 @@ class Training:
 
         def table(rows) -> torch.Tensor:
             return torch.as_tensor(rows, device=device)
+
+        labels = None
+        if 'goal_segmentation' in config.privileged:
+            if not isinstance(env, GoalLabelsEnv):
+                raise UserError('the environment knows what its goal pictures show',
+                                type(env).__name__, 'set goal_segmentation=0 (--set NAME=VALUE)')
+            labels = table(env.goal_segmentation)
         return Replay(
             # Many environments: at least a rollout and a window that is not all of it.
             max(-(-config.replay_steps // env.num_envs),
@@ -108,8 +115,7 @@ class Training:
             env.num_envs, size, table(env.goals),
             privileged=tuple(key for key in config.privileged
                              if key in ('depth', 'segmentation')),
-            goal_segmentation=(table(env.goal_segmentation)
-                               if 'goal_segmentation' in config.privileged else None),
+            goal_segmentation=labels,
             # Files are the leading process's matter; resumed, all are to have the same share.
             directory=self.folder / REPLAY if files and device.type == 'cpu' else None,
             device=device)

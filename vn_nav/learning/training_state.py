@@ -18,6 +18,7 @@ from vn_nav.errors import UserError
 from vn_nav.learning.rollout import Episode, Rollout
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
+from vn_nav.vector_env import RecallingEnv, RestorableEnv
 
 if TYPE_CHECKING:
     from vn_nav.learning.training import Training
@@ -28,6 +29,7 @@ def state_of(training: Training) -> dict:
     replay = training.learner.replay
     env = None  # of many processes each has its own, which nobody saves
     if training.env.restorable and training.processes.count == 1:
+        assert isinstance(training.env, RestorableEnv)  # what it calls itself
         env = {name: torch.from_numpy(np.array(rows))
                for name, rows in training.env.get_state().items()}
     return {
@@ -47,7 +49,7 @@ def state_of(training: Training) -> dict:
         'bags': None if training.bags is None else training.bags.state_dict(),
         # Of an environment that does not know its goals before it has seen them.
         'shown goals': (torch.from_numpy(training.env.shown_goals.copy())
-                        if hasattr(training.env, 'shown_goals') else None),
+                        if isinstance(training.env, RecallingEnv) else None),
         'replay': None if replay is None else replay.state_dict(),
     }
 
@@ -73,6 +75,10 @@ def restore(training: Training, state: dict) -> None:
     if training.bags is not None:
         training.bags.load_state_dict(state['bags'])
     if state.get('shown goals') is not None:
+        if not isinstance(training.env, RecallingEnv):
+            raise UserError('a training whose goals were seen on the way is resumed in an '
+                            'environment that recalls them', type(training.env).__name__,
+                            'resume it where it began, or start a new one')
         training.env.recall_goals(state['shown goals'].numpy())
     words = [f'resumed at {training.frames:,} frames']
     if state['env'] is not None and training.processes.count == 1:
@@ -85,6 +91,7 @@ def restore(training: Training, state: dict) -> None:
                               [Episode(*episode) for episode in episodes])
         training.env.set_difficulty(training.curriculum.tau)
         training.collector.load_state_dict(state['collector'])
+        assert isinstance(training.env, RestorableEnv)  # `state_of` has saved its state
         training.env.set_state({name: rows.numpy() for name, rows in state['env'].items()})
     else:
         # No environment's first episode is an old one, wherever the counting begins.

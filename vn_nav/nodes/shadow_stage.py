@@ -37,10 +37,10 @@ REPEAT_PERIOD_S = 0.3  # s without a picture, or an answer to it, after which it
 ARMING_NS = 10_000_000_000, 1_000_000  # ns before the drive, and between the pictures there
 # What the policy publishes, by the names that the node gives it.
 SUBSCRIBED = {'shadow/cmd_vel': Twist, 'action': Int8, 'action_names': String, 'arrived': Bool,
-         'diagnostics': DiagnosticArray}
+              'diagnostics': DiagnosticArray}
 # What it is shown, beside the pictures.
 PUBLISHED = {'camera_info': CameraInfo, 'odom': Odometry, 'goal_image': Image, 'clock': Clock,
-         'executed_action': String}
+             'executed_action': String}
 ABSOLUTE = ('clock', 'diagnostics')  # in the contract; here they are in the namespace as well
 
 

@@ -47,8 +47,14 @@ class Scene(Protocol):
     """A place to take pictures in; `HouseScene` is that of the embedded houses."""
 
     facts: dict  # for the topic `scene`, JSON
-    label_names: Sequence[str]  # behind the class ids
-    simulator: Simulator
+
+    @property
+    def label_names(self) -> Sequence[str]:
+        """Behind the class ids."""
+
+    @property
+    def simulator(self) -> Simulator:
+        """That draws the pictures."""
 
     def look(self, number: int, groups: int) -> tuple[np.ndarray, Frames]:
         """Poses [groups * VIEWS,4] of the groups from a number on, and what is seen there."""

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from vn_nav.robot import RobotSpec
-from vn_sim_bridge.simulator import Place
+from vn_sim_bridge.floor.places import WalledPlace
 
 TRANSLATION_NOISE = 0.02  # m per decision, standard deviation along the movement (thesis, 5.6)
 ROTATION_NOISE = math.radians(2.0)  # rad per decision (thesis, 5.7)
@@ -27,7 +27,7 @@ class World:
         radius: footprint radius of the robots [m].
     """
 
-    def __init__(self, places: Sequence[Place], place_index: np.ndarray, radius: float):
+    def __init__(self, places: Sequence[WalledPlace], place_index: np.ndarray, radius: float):
         self.place_index = np.array(place_index, np.int64)
         self.radius = radius
         self.poses = np.zeros((len(self.place_index), 4))  # x, y, yaw, pitch

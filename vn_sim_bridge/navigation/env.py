@@ -20,6 +20,7 @@ from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.floor.contacts import motion_noise
 from vn_sim_bridge.floor.floor_map import CELL
+from vn_sim_bridge.floor.places import as_house, have_floors, walled
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.navigation.env_config import EnvConfig, check_simulator
 from vn_sim_bridge.navigation.episodes import draw_grip, draw_motion_scale, draw_variant
@@ -115,9 +116,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._done = np.ones(n, bool)
         self._motion_scale = np.ones(n)
         self._last_image = np.zeros((n, 3, config.size, config.size), np.uint8)
-        floors = all(getattr(place, 'floor', None) is not None for place in self.places)
-        self._distances = (FloorDistances(self.places, n) if floors else SeparateDistances(n))
-        cells = self._distances.maps.shape[1:] if floors else (0, 0)
+        self._distances: FloorDistances | SeparateDistances = (
+            FloorDistances(self.places, n) if have_floors(self.places) else SeparateDistances(n))
+        cells = (self._distances.maps.shape[1:] if isinstance(self._distances, FloorDistances)
+                 else (0, 0))
         rows, columns = (math.ceil(side * CELL / SQUARE) for side in cells)
         self._visited = np.zeros((n, rows, columns), bool)
         # Options that are off add nothing to the state.
@@ -138,16 +140,16 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                             self.config.task, 'leave out explorer_action')
         table = turning_table(self.action_names)
         return Explorer(
-            self.places, self.num_envs, fov=self.robot.camera_fov,
+            list(map(walled, self.places)), self.num_envs, fov=self.robot.camera_fov,
             turn=self._deltas[table['rotate_left'], 2], length=self._deltas[table['forward'], 0],
             radius=tasks.ARRIVAL_RADIUS)
 
     def _make_task(self) -> tasks.Task:
-        config, common = self.config, (self.places, self.config.num_envs)
-        distance = config.min_start_distance
+        config, distance = self.config, self.config.min_start_distance
         if config.task == 'image':
-            return tasks.ImageGoal(*common, min_distance=distance,
+            return tasks.ImageGoal(self.places, config.num_envs, min_distance=distance,
                                    fixed_goals=config.one_goal_per_env)
+        common = list(map(as_house, self.places)), config.num_envs
         if config.task == 'object':
             return tasks.ObjectGoal(
                 *common, models=tasks.MODELS['object'], objects=config.objects,
@@ -279,7 +281,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if isinstance(self._distances, FloorDistances):
             self._distances.maps[:] = state['maps']
         else:
-            for n in everyone:
+            assert isinstance(self.task, tasks.ImageGoal)  # every other task has floors
+            for n in range(self.num_envs):
                 self._distances.set(n, self.task.goal_field(int(self._goal[n])).field)
         if self._explorer is not None:
             self._explorer.seen[:] = state['explorer_seen']
@@ -335,8 +338,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         else:
             given = [read_seed(seed)] * self.num_envs
         for n in np.nonzero(mask)[0]:
-            if given[n] is not None:
-                self._seeds[n], self._numbers[n] = given[n], own[n]
+            if (new := given[n]) is not None:
+                self._seeds[n], self._numbers[n] = new, own[n]
                 self._episode[n] = -1
 
     def step(self, actions):
@@ -450,6 +453,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     def _explore(self, env_ids: np.ndarray) -> np.ndarray:
         """Which robots stand on a square of floor that is new to their episodes, [K] bool."""
+        assert isinstance(self._distances, FloorDistances)  # see `check_simulator`
         corner = self._distances.origins[self.place_index[env_ids]]
         at = (self.simulator.poses[env_ids, :2] - corner) / SQUARE
         column, row = at.astype(np.int64).T
@@ -464,6 +468,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     def _distance_of(self, env_ids: np.ndarray, xy: np.ndarray) -> np.ndarray:
         return self._distances.at(env_ids, self.place_index[env_ids], xy)
+
+    def _distance_from(self, env: int, xy: np.ndarray) -> np.ndarray:
+        """Of positions [K,2] m in the place of one robot to its goal, [K] m."""
+        return self._distance_of(np.full(len(xy), env), xy)
 
     def _heading_error(self) -> np.ndarray:
         return tasks.heading_error(self.simulator.poses[:, 2], self._goal_yaw)
@@ -509,6 +517,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if 'oracle_action' in self.config.privileged:
             info['oracle_action'] = self.oracle_actions()
         if 'oracle_regret' in self.config.privileged:
+            assert self.simulator.planner is not None  # see `check_simulator`
             info['oracle_regret'] = self.simulator.planner.regrets(self.simulator.poses,
                                                                    self.goal_poses[self._goal])
         if 'goal_pose' in self.config.privileged:
@@ -521,6 +530,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     def _explore_action(self, reset: np.ndarray, overlap: np.ndarray) -> np.ndarray:
         """What the `Explorer` would do, [N] int64; it looks from here."""
+        assert self._explorer is not None  # the caller has one
+        assert isinstance(self._distances, FloorDistances)  # where there are walls is a floor
         self._explorer.begin(np.nonzero(reset)[0])
         turned = np.where(self._last_action < 0, 0, np.sign(self._deltas[self._last_action, 2]))
         turns = self._explorer.turns(self.simulator.poses, self.place_index, overlap,
@@ -575,7 +586,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         return np.array([self._oracle.action(
             self.simulator.poses[n], self._goal_yaw[n] if near[n] else None,
             functools.partial(self.simulator.reach, n),
-            lambda ends, n=n: self._distance_of(np.full(len(ends), n), ends))
+            functools.partial(self._distance_from, n))
             for n in range(self.num_envs)], np.int64)
 
 

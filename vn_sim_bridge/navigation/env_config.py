@@ -7,6 +7,7 @@ import dataclasses
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_nav.scenes import one_simulator
+from vn_sim_bridge.floor.places import have_floors
 from vn_sim_bridge.navigation.episodes import MIN_START_DISTANCE
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.simulator import Simulator
@@ -89,7 +90,6 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
     can, told = simulator.capabilities, set(config.privileged)
     varies = config.randomisation.varies_pictures
     own_goals = (config.goals_per_room, config.goal_seed) == (1, 0)
-    floors = all(getattr(place, 'floor', None) is not None for place in simulator.places)
     image = config.task == 'image'
     rules = (
         (simulator.num_envs == config.num_envs, 'a simulator has as many robots as the '
@@ -109,7 +109,7 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
          'oracle_action needs a simulator that knows ways', 'oracle_action'),
         (can.walls or 'explorer_action' not in told, 'the explorer needs a simulator that knows '
          'walls', 'explorer_action'),
-        (floors or not config.exploration_reward,
+        (have_floors(simulator.places) or not config.exploration_reward,
          'exploration_reward needs places with a floor map', config.exploration_reward),
         (simulator.planner is not None or 'oracle_regret' not in told,
          'the simulator knows what each action costs on the ways there (as a recorded drive does)',

@@ -11,12 +11,13 @@ Targets of a loss only; no network is shown its state.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numba
 import numpy as np
 
 from vn_sim_bridge.floor.floor_map import CELL
-from vn_sim_bridge.houses.house import House
+from vn_sim_bridge.floor.places import WalledPlace
 from vn_sim_bridge.navigation.oracle import BLOCKED_COST, TURN_COST
 
 COARSE = 2  # cells of the floor map a side of one of the explorer's
@@ -39,7 +40,7 @@ class Explorer:
         radius: distance [m] from which on a robot only turns to the goal's heading.
     """
 
-    def __init__(self, houses: list[House], num_envs: int, *, fov: float, turn: float,
+    def __init__(self, houses: Sequence[WalledPlace], num_envs: int, *, fov: float, turn: float,
                  length: float, radius: float):
         rows = max(house.floor.free.shape[0] for house in houses)
         columns = max(house.floor.free.shape[1] for house in houses)
@@ -90,7 +91,7 @@ class Explorer:
         return wanted
 
 
-def _walls(house: House, shape: tuple[int, int]) -> np.ndarray:
+def _walls(house: WalledPlace, shape: tuple[int, int]) -> np.ndarray:
     """[rows,columns] of the explorer's cells that a wall touches, or that lie outside."""
     wall = np.zeros(shape, bool)
     x0, y0 = house.floor.origin

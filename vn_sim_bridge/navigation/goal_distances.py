@@ -6,30 +6,37 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vn_nav.errors import UserError
 from vn_sim_bridge.floor.distance import FloorDistance, interpolate
 from vn_sim_bridge.floor.floor_map import CELL
-from vn_sim_bridge.simulator import Distance, Place
+from vn_sim_bridge.floor.places import FloorPlace
+from vn_sim_bridge.simulator import Distance
 
 
 class FloorDistances:
     """Over floors: all maps in one array, one look-up for all robots.
 
     Args:
-        places: with `floor`; num_envs: robots, N.
+        places: of the robots; num_envs: robots, N.
     """
 
-    def __init__(self, places: Sequence[Place], num_envs: int):
+    def __init__(self, places: Sequence[FloorPlace], num_envs: int):
         shapes = [place.floor.free.shape for place in places]
         rows, columns = (max(shape[axis] for shape in shapes) for axis in (0, 1))
         self.maps = np.full((num_envs, rows, columns), np.inf, np.float32)
         self.origins = np.array([place.floor.origin for place in places])
 
-    def set(self, env: int, distance: FloorDistance | None) -> None:
-        """A new goal of one robot; None: it has none."""
+    def set(self, env: int, distance: Distance | None) -> None:
+        """A new goal of one robot; None: it has none.
+
+        Raises:
+            UserError: the distance is none over a floor.
+        """
         self.maps[env] = np.inf
         if distance is not None:
-            rows, columns = distance.values.shape
-            self.maps[env, :rows, :columns] = distance.values
+            values = over_floor(distance).values
+            rows, columns = values.shape
+            self.maps[env, :rows, :columns] = values
 
     def at(self, env_ids: np.ndarray, places: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """Of robots [K] in places [K] at poses [K,>=2] to their goals, [K] m."""
@@ -51,3 +58,16 @@ class SeparateDistances:
         """Of robots [K] at poses [K,>=2] to their goals, [K] m."""
         return np.array([np.inf if self._own[n] is None else self._own[n].at(pose[None])[0]
                          for n, pose in zip(env_ids, poses, strict=True)])
+
+
+def over_floor(distance: Distance) -> FloorDistance:
+    """The distance, of which the map is asked.
+
+    Raises:
+        UserError: it has none.
+    """
+    if not isinstance(distance, FloorDistance):
+        raise UserError('the distances of a place with a floor map are over that floor '
+                        '(FloorDistance)', type(distance).__name__,
+                        'give such ones from `distance_to`, or no `floor`')
+    return distance

@@ -27,7 +27,7 @@ from vn_nav.arrival import (  # noqa: F401
 )
 from vn_sim_bridge.counter_random import Stream, uniform
 from vn_sim_bridge.floor.distance import FloorDistance
-from vn_sim_bridge.houses.house import House
+from vn_sim_bridge.floor.places import HousePlace
 from vn_sim_bridge.houses.labels import LABEL
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS
 from vn_sim_bridge.navigation.episodes import (
@@ -132,6 +132,7 @@ class Task(Protocol):
     """Goals and rewards of N environments, of which i lives in place i modulo their number."""
 
     views: list[View]
+    ranges: list[tuple[int, int]]  # first view and number of goals, by place
     models: tuple[str, ...]  # names of the objects that it places
     objects: int  # most objects at a time
     state: dict[str, np.ndarray]  # what changes from step to step
@@ -204,7 +205,7 @@ class ImageGoal(_Pool):
 class ObjectGoal(_Pool):
     """To within 1 m of an object that lies somewhere else in every episode (thesis, 5.6)."""
 
-    def __init__(self, houses: list[House], num_envs: int, *, models: tuple[str, ...],
+    def __init__(self, houses: Sequence[HousePlace], num_envs: int, *, models: tuple[str, ...],
                  objects: int, pictures: int, min_distance: float, seed: int):
         super().__init__()
         self.houses, self.models, self.objects = houses, models, objects
@@ -222,7 +223,8 @@ class ObjectGoal(_Pool):
         first, count = self.ranges[house]
         local = draw_goal(count, *counter)
         shown = draw_wrong_goal(count, local, *counter) if mode == WRONG else local
-        picture = draw_index(self.pictures, counter[0], Stream.GOAL_VARIANT, *counter[1:], 1)
+        seed, env, episode = counter
+        picture = draw_index(self.pictures, seed, Stream.GOAL_VARIANT, env, episode, 1)
         right = first + local * self.pictures
         return right, -1 if mode == BLANK else first + shown * self.pictures + picture
 
@@ -253,7 +255,7 @@ class RoomGoal(_Pool):
             room's objects, two decisions in a row.
     """
 
-    def __init__(self, houses: list[House], num_envs: int, *, must_see: bool,
+    def __init__(self, houses: Sequence[HousePlace], num_envs: int, *, must_see: bool,
                  min_distance: float):
         super().__init__()
         self.must_see = must_see
@@ -303,7 +305,7 @@ class Collect(_Pool):
 
     APPLE, LEMON = 0, 1
 
-    def __init__(self, houses: list[House], num_envs: int, *, objects: int):
+    def __init__(self, houses: Sequence[HousePlace], num_envs: int, *, objects: int):
         super().__init__()
         self.houses, self.objects = houses, objects
         self.models = MODELS['collect']
@@ -328,7 +330,7 @@ class Collect(_Pool):
         return Judgement(np.zeros(len(reward), bool), reward, touched)
 
 
-def place_objects(house: House, kinds: list[int], counter: tuple[int, int, int]
+def place_objects(house: HousePlace, kinds: list[int], counter: tuple[int, int, int]
                   ) -> tuple[Placed, ...]:
     """Objects at free cells of a house, at least 0.8 m apart while there is room for it."""
     seed, env, episode = counter
@@ -345,7 +347,7 @@ def place_objects(house: House, kinds: list[int], counter: tuple[int, int, int]
     return tuple(placed)
 
 
-def _portrait(index: int, house: House, model: int, name: str, counter) -> View:
+def _portrait(index: int, house: HousePlace, model: int, name: str, counter) -> View:
     """A picture of an object from 1 to 2 m, at some free place of the house."""
     cells = house.floor.centres()
     seed, env, episode = counter

@@ -8,6 +8,7 @@ go as PyTorch tensors that share the device's memory. The same seeds give the sa
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from vn_sim_bridge.floor.contacts import (
 from vn_sim_bridge.floor.floor_map import CELL
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.navigation.env_config import EnvConfig
+from vn_sim_bridge.navigation.goal_distances import over_floor
 from vn_sim_bridge.render.pack import FACING
 from vn_sim_bridge.render.randomisation import draw_appearance
 from vn_sim_bridge.render.warp_renderer import WarpRenderer, camera_frame
@@ -514,6 +516,11 @@ def share_in_view(points: wp.array3d(dtype=wp.float32), picture: wp.array(dtype=
         share[n] = wp.float32(_f(seen) / _f(known))
 
 
+def _variables(struct: type) -> dict[str, Any]:
+    """Of a struct, by name."""
+    return struct.vars  # type: ignore[attr-defined]  # `wp.struct` adds it, and Warp is not typed
+
+
 class WarpNavigationEnv:
     """Image-goal navigation on one device; see `NavigationEnv` for what it simulates.
 
@@ -572,8 +579,8 @@ class WarpNavigationEnv:
                         self._put(np.zeros((self.num_envs, 0)), np.int64))
         self._overlap = wp.zeros(self.num_envs, dtype=wp.float32, device=device)
         self._draw_goals(task, scenes)
-        self._state = {name: wp.to_torch(getattr(self._robots, name)) for name in Robots.vars
-                       if name not in NOT_STATE}
+        self._state = {name: wp.to_torch(getattr(self._robots, name))
+                       for name in _variables(Robots) if name not in NOT_STATE}
         self._drawn = {name: wp.to_torch(getattr(self.renderer, name))
                        for name in ('rgb', 'depth', 'labels')}
         self._in_view = wp.to_torch(self._overlap)
@@ -583,11 +590,12 @@ class WarpNavigationEnv:
 
     def _upload_houses(self, task: tasks.ImageGoal) -> Houses:
         fields = list(map(task.goal_field, range(len(task.views))))
-        shapes = [entry.field.values.shape for entry in fields]
+        solved = [over_floor(entry.field).values for entry in fields]
+        shapes = [values.shape for values in solved]
         maps = np.full((len(fields), max(s[0] for s in shapes), max(s[1] for s in shapes)), np.inf,
                        np.float32)
-        for k, entry in enumerate(fields):
-            maps[k, :shapes[k][0], :shapes[k][1]] = entry.field.values
+        for k, values in enumerate(solved):
+            maps[k, :shapes[k][0], :shapes[k][1]] = values
         out = Houses()
         out.rects = self._put(np.concatenate([h.obstacle_rects for h in self.places]), np.float64)
         out.first_rect = self._put(
@@ -629,7 +637,7 @@ class WarpNavigationEnv:
         shapes = {'pose': (n, 4), 'camera': (n, 5), 'camera_offset': (n, 3), 'cube': (n, 6, 3),
                   'lamps': (n, rooms, 3), 'goal_pose': (n, 4)}
         robots = Robots()
-        for name, variable in Robots.vars.items():
+        for name, variable in _variables(Robots).items():
             setattr(robots, name, wp.zeros(shapes.get(name, (n,)), dtype=variable.type.dtype,
                                            device=self.device))
         robots.house = self._put(np.arange(n) % len(self.places), np.int64)

@@ -95,9 +95,10 @@ class HouseSimulator(BaseSimulator):
                    size=setup.size, threads=setup.threads, randomisation=setup.randomisation,
                    models=setup.models, objects=setup.objects)
 
-    def __init__(self, houses: Sequence[House], place_index: Sequence[int], *, robot: RobotSpec,
-                 size: int = 84, threads: int = 1, randomisation: Randomisation | None = None,
-                 models: Sequence[str] = (), objects: int = 0):
+    def __init__(self, houses: Sequence[House], place_index: Sequence[int] | np.ndarray, *,
+                 robot: RobotSpec, size: int = 84, threads: int = 1,
+                 randomisation: Randomisation | None = None, models: Sequence[str] = (),
+                 objects: int = 0):
         self.places = list(houses)
         for house in self.places:
             if robot.footprint_radius > house.footprint_radius:
@@ -106,24 +107,22 @@ class HouseSimulator(BaseSimulator):
                                 robot.footprint_radius, 'use a smaller robot')
         self.robot = robot
         self.world = World(self.places, np.asarray(place_index), robot.footprint_radius)
-        self.num_envs = len(self.world.place_index)
+        # One array each, in the world and here: a move changes both.
+        self.poses, self.place_index = self.world.poses, self.world.place_index
+        self.num_envs = len(self.place_index)
         self.randomisation = randomisation or Randomisation()
-        self._renderer = Rasterizer([*(house.scene for house in self.places),
-                                     *map(object_scene, models)], size, threads=threads)
+        self._renderer: Rasterizer | None = Rasterizer(  # None: closed
+            [*(house.scene for house in self.places), *map(object_scene, models)], size,
+            threads=threads)
         self.objects = no_objects(self.num_envs, objects)
         self._all = np.arange(self.num_envs)
         self._frames: Frames | None = None
         self._appearance = self.appearance(0, Stream.APPEARANCE, self._all, 0 * self._all)
 
     @property
-    def poses(self) -> np.ndarray:
-        """[N,4] x, y, yaw, pitch; a view that changes with the next move."""
-        return self.world.poses
-
-    @property
-    def place_index(self) -> np.ndarray:
-        """[N] the house of each robot."""
-        return self.world.place_index
+    def _painter(self) -> Rasterizer:
+        assert self._renderer is not None  # not closed yet
+        return self._renderer
 
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
         """Displace robots by [K,4] in their own frames, up to the first contact."""
@@ -135,7 +134,7 @@ class HouseSimulator(BaseSimulator):
 
     def appearance(self, seed: int | np.ndarray, stream: Stream, env, episode) -> Appearance:
         """Light and camera of some episodes, or of some goal pictures."""
-        return draw_appearance(self.randomisation, self._renderer.rooms, seed, stream, env,
+        return draw_appearance(self.randomisation, self._painter.rooms, seed, stream, env,
                                episode)
 
     def apply_appearance(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream,
@@ -189,7 +188,7 @@ class HouseSimulator(BaseSimulator):
             placed: the objects in each picture; default none.
         """
         if appearance is None:
-            appearance = draw_appearance(Randomisation(), self._renderer.rooms, 0,
+            appearance = draw_appearance(Randomisation(), self._painter.rooms, 0,
                                          Stream.APPEARANCE, np.arange(len(poses)), 0)
         objects = None
         if placed is not None:
@@ -216,7 +215,7 @@ class HouseSimulator(BaseSimulator):
 
     def _draw(self, place_index, poses, out, appearance, keys, objects) -> Frames:
         cameras, fov = self.cameras(poses, appearance)
-        frames = Frames(*self._renderer.render(
+        frames = Frames(*self._painter.render(
             place_index, cameras, fov, out,
             lights=Lights(appearance.cube, appearance.lamps), objects=objects))
         if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:

@@ -223,7 +223,7 @@ def _make_index(poses: np.ndarray) -> _Index:
     square = row * columns + column
     order = np.argsort(square, kind='stable')
     first = np.searchsorted(square[order], np.arange(columns * (int(row.max()) + 1) + 1))
-    return _Index(*low, columns, first, order)
+    return _Index(float(low[0]), float(low[1]), columns, first, order)
 
 
 @numba.njit(cache=True)
