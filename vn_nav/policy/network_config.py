@@ -82,7 +82,7 @@ class NetworkConfig:
             (self.filter_name in FILTERS, f'the action filter is one of {", ".join(FILTERS)}',
              self.action_filter),
             (self.filter_name == NONE or self.moves,
-             'an action filter is told what the actions do: it needs moves', self.action_filter),
+             'an action filter needs the moves of the actions', self.action_filter),
             (self.places == 0 or (2 <= self.places <= 1024 and self.frames == 1
                                   and self.architecture != 'icra2017'),
              'a policy with an LSTM has no place cells, or 2 to 1024', self.places),

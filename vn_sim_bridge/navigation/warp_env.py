@@ -8,6 +8,7 @@ go as PyTorch tensors that share the device's memory. The same seeds give the sa
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.navigation.goal_distances import over_floor
 from vn_sim_bridge.render.pack import FACING
 from vn_sim_bridge.render.randomisation import draw_appearance
+from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.render.warp_renderer import WarpRenderer, camera_frame
 from vn_sim_bridge.simulators.house import WORLD_VERSION, open_houses
 
@@ -578,7 +580,7 @@ class WarpNavigationEnv:
                         self._put(np.zeros((self.num_envs, 0, 4)), np.float64),
                         self._put(np.zeros((self.num_envs, 0)), np.int64))
         self._overlap = wp.zeros(self.num_envs, dtype=wp.float32, device=device)
-        self._draw_goals(task, scenes)
+        self._draw_goals(task, drawn)
         self._state = {name: wp.to_torch(getattr(self._robots, name))
                        for name in _variables(Robots) if name not in NOT_STATE}
         self._drawn = {name: wp.to_torch(getattr(self.renderer, name))
@@ -644,7 +646,7 @@ class WarpNavigationEnv:
         robots.episode.fill_(-1)
         return robots
 
-    def _draw_goals(self, task: tasks.ImageGoal, scenes) -> None:
+    def _draw_goals(self, task: tasks.ImageGoal, scenes: Sequence[Scene]) -> None:
         """Every goal's pictures, in the lights that `NavigationEnv` shows them in."""
         varied, size, variants = self.config.randomisation, self.config.size, self._rules.variants
         goal = np.repeat(np.arange(len(task.views)), variants)
