@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import os
 import time
 from pathlib import Path
 
@@ -33,13 +32,21 @@ def remove_dead_segments(folder: Path = FOLDER, min_age: float = MIN_AGE_S) -> i
         if '_port' in segment.name:  # small, and shared by several processes
             continue
         # Of another user, or gone meanwhile, or in use.
-        with contextlib.suppress(OSError), open(path, 'rb') as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if time.time() - os.fstat(lock.fileno()).st_mtime < min_age:
+        with contextlib.suppress(OSError):
+            # Before the lock is tried: its owner may be about to take it.
+            if time.time() - path.stat().st_mtime < min_age:
                 continue
-            with contextlib.suppress(FileNotFoundError):
-                size = segment.stat().st_blocks * 512
-                segment.unlink()
-                freed += size
-            path.unlink()
+            with open(path, 'rb') as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                freed += _size(segment)
+                segment.unlink(missing_ok=True)
+                path.unlink()
     return freed
+
+
+def _size(segment: Path) -> int:
+    """Bytes of memory that a segment takes; 0: there is none."""
+    try:
+        return segment.stat().st_blocks * 512
+    except FileNotFoundError:
+        return 0
