@@ -3,6 +3,7 @@
 import fcntl
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
 from pathlib import Path
@@ -15,6 +16,10 @@ DOMAINS = range(1, 102)  # all that leave Linux's ephemeral ports alone, less th
 # Set at import: rclpy reads them once, and the processes that tests start inherit them.
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(ROOT / 'config' / 'fastdds_localhost.xml')
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+# Under `nohup` or `timeout` SIGHUP is ignored, also by the nodes that tests start, which then do
+# not end by it. A handler is no matter of theirs.
+if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda *_: None)
 
 
 def pytest_configure(config):
@@ -61,6 +66,15 @@ def _without_unexpected_skip(report):
         report.longrepr = (f'unexpected skip: {reason}\n(a test may skip where its reason starts '
                            "with 'expected:' and names what the machine lacks)")
     return report
+
+
+@pytest.fixture(autouse=True)
+def _own_signals():
+    """A test that ran a node's main in this process would leave its signals ignored, for all."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    assert [signal.getsignal(number) for number in numbers] == before, 'signal handlers changed'
 
 
 @pytest.fixture

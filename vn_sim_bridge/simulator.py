@@ -10,6 +10,7 @@ Poses are [K,4] float64: x, y [m], yaw (left), pitch (down) [rad] in the map fra
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -255,7 +256,7 @@ class Simulator(Protocol):
         """Let go of processes, files and memory; a second time it does nothing."""
 
 
-class BaseSimulator:
+class BaseSimulator(abc.ABC):
     """A `Simulator` without light, objects and planner: a new one says only what it has.
 
     To write: `version`, `capabilities`, `open`, `move` and `draw`; and `place_names` where the
@@ -274,13 +275,13 @@ class BaseSimulator:
     places: Sequence[Place]
 
     @classmethod
+    @abc.abstractmethod
     def open(cls, scenes: Sequence[SceneName], setup: Setup) -> Simulator:
         """The simulator of some scenes, all of them its own.
 
         Raises:
             UserError: a scene that there is not.
         """
-        raise NotImplementedError
 
     def __init__(self, places: Sequence[Place], setup: Setup):
         self.places, self.setup, self.robot = list(places), setup, setup.robot
@@ -292,7 +293,8 @@ class BaseSimulator:
 
     def draw(self, place_index: np.ndarray, poses: np.ndarray) -> Frames:
         """Pictures from poses [K,4] in places [K]."""
-        raise NotImplementedError
+        raise UserError('a simulator draws pictures from any pose', type(self).__name__,
+                        'write its `draw`, or `observe` and `view`')
 
     @property
     def seen_from(self) -> np.ndarray:
@@ -312,9 +314,9 @@ class BaseSimulator:
         raise UserError('a simulator that cannot put robots anywhere spawns them',
                         type(self).__name__, 'write its `spawn`')
 
+    @abc.abstractmethod
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
         """See `Simulator`."""
-        raise NotImplementedError
 
     def observe(self, env_ids: np.ndarray | None = None, keys: np.ndarray | None = None) -> Frames:
         """See `Simulator`."""

@@ -14,7 +14,7 @@ import time
 import numpy as np
 import pytest
 import torch
-from faults import no_file_beyond
+from faults import no_file_beyond, own_mounts
 from two_bars import TwoBars, collected
 
 from vn_nav.errors import UserError
@@ -279,12 +279,7 @@ cp -a "$1/disk/run" "$1/finished"
 @pytest.mark.timeout(400)
 def test_a_full_disk_ends_a_training_in_one_line_and_room_lets_it_finish(tmp_path):
     # With the first process of its own process namespace all others end.
-    spaces = [['unshare', own, '--pid', '--fork', '--kill-child'] for own in ('-m', '-rm')]
-    probe = ['sh', '-c', f'mount -t tmpfs tmpfs {tmp_path}']
-    inside = next((space for space in spaces if shutil.which('unshare') and subprocess.run(
-        [*space, *probe], capture_output=True).returncode == 0), None)
-    if inside is None:
-        pytest.skip('expected: this machine lets nobody mount a small disk')
+    inside = own_mounts(tmp_path, '--pid', '--fork', '--kill-child')
     (tmp_path / 'disk').mkdir()
     subprocess.run([*inside, 'bash', '-c', FULL_DISK, 'bash', str(tmp_path), sys.executable,
                     '--preset', 'fast', *KILLED['fast'][0]], check=True, timeout=360)

@@ -198,18 +198,3 @@ def test_the_first_compilation_shows_progress_and_can_be_ended(number, tmp_path,
         process.send_signal(number)
         assert process.wait(PATIENCE) == 0, log.read_text()
     assert 'Traceback' not in log.read_text() and 'ready' not in log.read_text()
-
-
-HANGS = """
-import time, rclpy
-from vn_nav.nodes import process
-process.SHUTDOWN_TIMEOUT_S = 0.5
-rclpy.try_shutdown = lambda: time.sleep(1000)
-process.run_node('a_node', lambda ended: None, lambda node, ended: None, [])
-"""
-
-
-@pytest.mark.slow
-def test_a_middleware_that_does_not_shut_down_does_not_keep_the_process():
-    done = subprocess.run([sys.executable, '-c', HANGS], timeout=60)
-    assert done.returncode == 0

@@ -7,7 +7,6 @@ import sys
 import pytest
 from paths import ROOT
 
-from vn_nav.nodes import process
 from vn_nav.nodes.shared_memory import FOLDER, remove_dead_segments
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -18,6 +17,17 @@ node = rclpy.create_node('participant')
 print('up', flush=True)
 time.sleep(100)
 """
+STARTS = """
+import functools, sys
+from vn_nav.nodes import process
+process.remove_dead_segments = functools.partial(process.remove_dead_segments, min_age=0.0)
+sys.exit(process.run_node('a_node', lambda ended: None, lambda node, ended: None, sys.argv[1:]))
+"""
+
+
+def start(*words):
+    """The exit code of a node in a process of its own: its end ignores the process's signals."""
+    return subprocess.run([sys.executable, '-c', STARTS, *words], cwd=ROOT).returncode
 
 
 @pytest.fixture
@@ -51,17 +61,13 @@ def test_the_segment_of_a_killed_process_is_freed_and_that_of_a_live_one_stays(p
     assert not any(path.exists() for path in own)
 
 
-def test_a_node_frees_them_before_it_starts(participant, monkeypatch):
+def test_a_node_frees_them_before_it_starts(participant):
     child, own = participant
     child.kill()
     child.wait()
-    monkeypatch.setattr(process, 'remove_dead_segments',
-                        lambda: remove_dead_segments(min_age=0.0))
-    monkeypatch.setattr(process, '_end_anyway', lambda code: None)  # this process goes on
-    assert process.run_node('no_node', lambda ended: None, lambda node, ended: None,
-                            ['no argument']) == 2
+    assert start('no argument') == 2
     assert any(path.exists() for path in own), 'refused arguments start nothing'
-    process.run_node('a_node', lambda ended: None, lambda node, ended: None, [])
+    assert start() == 0
     assert not any(path.exists() for path in own)
 
 

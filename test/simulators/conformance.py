@@ -1,5 +1,6 @@
 """What every simulator keeps: inherit `Conformance`, write `make`, and its tests run."""
 
+import abc
 import dataclasses
 
 import numpy as np
@@ -25,16 +26,16 @@ def resident_mb():
     return int(line.split()[1]) / 1024
 
 
-class Conformance:
+class Conformance(abc.ABC):
     """The contract of `vn_sim_bridge.simulator.Simulator`, as tests."""
 
     actions = DRIVE_ACTIONS
     contact_slack = 0.02  # m that a robot may still creep towards what it touches
     depth_slack = 0.9  # share of a picture's points that the same pose sees again
 
+    @abc.abstractmethod
     def make(self, num_envs, size=SIZE):
         """A new simulator of `num_envs` robots with pictures of `size` pixels."""
-        raise NotImplementedError
 
     def config(self, num_envs, **options):
         """Of an environment about it."""

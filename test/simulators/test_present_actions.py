@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from paths import ROOT
 
 from vn_nav.cli.world import load_for, make_env
 from vn_nav.evaluation.evaluator import PolicyActor
 from vn_nav.scenes import house_scene
 
-ROOT = Path(__file__).resolve().parents[2]
 # Of 60 decisions of 4 environments: actions as digits (4: declared), the last poses, and how many
 # decisions the last episodes had.
 RECORDED = json.loads((Path(__file__).parent / 'present_actions.json').read_text())

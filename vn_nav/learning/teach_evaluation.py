@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -119,20 +118,19 @@ class Evaluation:
 
     Args:
         folder: of the run: gets `evaluation.json` after every row.
-        facts: of the result, such as the name of the bag.
+        result: without splits, as `measurement.new_result` makes it.
         graphs: the places with their goals by the split's name.
         make_env: (graph, environments, stop) -> vector environment.
         robot: for durations.
         threshold: of the arrival heads.
     """
 
-    def __init__(self, folder: Path, facts: dict, graphs: dict[str, Any], make_env: Callable,
+    def __init__(self, folder: Path, result: dict, graphs: dict[str, Any], make_env: Callable,
                  robot: RobotSpec, threshold: float):
         self.folder, self.graphs, self.make_env = folder, graphs, make_env
         self.robot, self.threshold = robot, threshold
         self.measured: dict[str, evaluator.Rows] = {}
-        self.result = {**facts, 'decoding': DECODING, 'seed': SEED,
-                       'date': datetime.date.today().isoformat(), 'splits': {}}
+        self.result = result
 
     def run(self, chosen: Plan, network: Policy, before: Policy | None, stages: Stages) -> None:
         """Measure the rows of a plan, one after the other.

@@ -20,14 +20,17 @@ import torch
 from vn_nav.bags.mapping.recorded_place import read_place
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
+from vn_nav.evaluation.measurement import new_result
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BANK, BATCH, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
 from vn_nav.learning.taught_place import Place, Watched
 from vn_nav.learning.teach_evaluation import (
+    DECODING,
     DRIVE_SPLITS,
     LEAST,
+    SEED,
     Evaluation,
     Plan,
     cost_of,
@@ -201,13 +204,13 @@ class Teaching:
         taught = load_checkpoint(self.folder)
         known = self.given.info['stop_threshold'] if self.given else None
         threshold = known or evaluator.STOP_THRESHOLD
-        facts = {'checkpoint': str(self.folder), 'bag': self.bag.name,
-                 'simulator': taught.info['simulator'],
-                 'world_version': taught.info['world_version'], 'task': 'image',
-                 'max_decisions': DECISIONS}
+        # The checkpoint is written again with what is measured: its checksum is not final.
+        info = {key: value for key, value in taught.info.items() if key != 'sha256'}
+        result = new_result(info, checkpoint=str(self.folder), bag=self.bag.name,
+                            max_decisions=DECISIONS, decoding=DECODING, seed=SEED)
         graphs = {name: graph for name, graph in self._graphs().items() if graph is not None}
         self.evaluation = Evaluation(
-            self.out, facts, graphs,
+            self.out, result, graphs,
             lambda graph, envs, stop: self._env(graph, envs, stop=stop), self.robot, threshold)
         try:
             self.evaluation.run(self._plan(self.stages.left - RESERVED), taught.network,

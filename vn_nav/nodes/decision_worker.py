@@ -13,6 +13,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Int8, String
 
 from vn_msgs_py import images
+from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.window import Window
 from vn_nav.observation import crop_fraction, needed_side, preprocess
@@ -150,14 +151,9 @@ class DecisionWorker:
     def _take_goal(self, message: Image) -> None:
         with self._wake:
             self._goal_in_force = message
-        try:
-            # A goal picture comes from a camera like this one; it is cropped the same way.
-            picture = self._prepare(message)
-        except Exception as error:  # whatever is wrong with it: a picture moves no robot
-            self._node.get_logger().error(f'goal_image refused: {shorten(str(error))}')
-            with self._wake:
-                self._navigator.refuse_goal(str(error))
-                self._wake.notify_all()
+        # A goal picture comes from a camera like this one; it is cropped the same way.
+        picture = prepared(self._prepare, message, self._wake, self._refuse_goal)
+        if picture is None:
             return
         self._runtime.set_goal(picture)
         with self._wake:
@@ -167,13 +163,14 @@ class DecisionWorker:
                                             else -math.inf)
                 self.tell_arrival(again=True)
 
+    def _refuse_goal(self, why: str) -> None:
+        self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
+        self._navigator.refuse_goal(why)
+
     def _take_frame(self, message, stamp: float, received: float) -> None:
-        try:
-            picture = self._prepare(message)
-        except Exception as error:  # whatever is wrong with it: as good as no picture
-            with self._wake:
-                self._navigator.bad_frame(str(error) or repr(error), time.monotonic())
-                self._wake.notify_all()
+        picture = prepared(self._prepare, message, self._wake,
+                           lambda why: self._navigator.bad_frame(why, time.monotonic()))
+        if picture is None:
             return
         with self._wake:
             now = time.monotonic()

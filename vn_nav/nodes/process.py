@@ -32,7 +32,6 @@ __all__ = ['Ended', 'compiling', 'run_node', 'spin']
 _ros: Any = rclpy._rclpy_pybind11  # type: ignore[attr-defined]  # compiled, without types
 REFUSED = (NameValidationException, ParameterException,
            _ros.RCLError, _ros.RCLInvalidROSArgsError, _ros.UnknownROSArgsError)
-SHUTDOWN_TIMEOUT_S = 10.0  # seen once: a process that did not end in 100 s
 AnyNode = TypeVar('AnyNode', bound=Node)
 USAGE = """usage: ros2 run vn_nav {name} [--ros-args [-p name:=value] [--params-file file]
        [-r topic:=other] [-r __ns:=/namespace] [--log-level debug|info|warn|error|fatal]]
@@ -92,21 +91,10 @@ def run_node(name: str, make: Callable[[Ended], AnyNode],
     finally:
         if node is not None:
             node.destroy_node()
-        _end_anyway(code)
         rclpy.try_shutdown()
         signals.ignore()  # the interpreter would otherwise end by the next one, in its shutdown
         _flush()
     return code
-
-
-def _end_anyway(code: int) -> None:
-    """End the process soon, should the middleware's own shutdown hang.
-
-    By now everything of ours is out and closed.
-    """
-    timer = threading.Timer(SHUTDOWN_TIMEOUT_S, os._exit, (code,))
-    timer.daemon = True
-    timer.start()
 
 
 def spin(node: Node, ended: Ended) -> None:

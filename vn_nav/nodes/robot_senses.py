@@ -21,6 +21,7 @@ from vn_msgs_py import images
 from vn_msgs_py.camera import field_of_view
 from vn_nav.bags.stamped import STAMP_WINDOW_S
 from vn_nav.nodes.command_output import CommandOutput
+from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.recorded_topics import RecordedTopics
 from vn_nav.observation import needed_side, preprocess, preprocess_map
 from vn_nav.policy.frame_gate import shorten
@@ -125,12 +126,9 @@ class Senses:
             # In lock-step stamps are the simulator's ticks and nothing is late.
             if not self._navigator.admit(stamp, None if self._lock_step else self._now()):
                 return
-        try:
-            picture = self._prepare(message)
-        except Exception as error:  # whatever is wrong with it: as good as no picture
-            with self._wake:
-                self._navigator.bad_frame(str(error) or repr(error), time.monotonic())
-                self._wake.notify_all()
+        picture = prepared(self._prepare, message, self._wake,
+                           lambda why: self._navigator.bad_frame(why, time.monotonic()))
+        if picture is None:
             return
         with self._wake:
             self._navigator.good_frame(received)
@@ -144,12 +142,8 @@ class Senses:
             if not self._goal_watch.is_new((stamp.sec, stamp.nanosec), content, time.monotonic()):
                 return
             self._navigator.new_goal()
-        try:
-            picture = self._prepare(message)
-        except Exception as error:  # whatever is wrong with it: a picture moves no robot
-            self._node.get_logger().error(f'goal_image refused: {shorten(str(error))}')
-            with self._wake:
-                self._navigator.refuse_goal(str(error))
+        picture = prepared(self._prepare, message, self._wake, self._refuse_goal)
+        if picture is None:
             return
         with self._wake:
             # Pictures up to then belong to the episode before.
@@ -158,6 +152,10 @@ class Senses:
             self.goal, self.frame = picture, None
             self.goals += 1
             self._wake.notify_all()
+
+    def _refuse_goal(self, why: str) -> None:
+        self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
+        self._navigator.refuse_goal(why)
 
     def _on_reward(self, message: Float32) -> None:
         if not math.isfinite(message.data):
