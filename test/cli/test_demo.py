@@ -94,6 +94,18 @@ def test_declared_stops_are_counted_from_the_bag(tmp_path):
     assert sum(said) == 3 and said[-1]
 
 
+def test_the_recorder_has_each_house_from_its_first_picture(demo):
+    """The policy drives only when the recorder hears everything: a decision needs a picture."""
+    pictures, decisions, begins = [], [], []
+    with AnyReader([demo / 'bag']) as reader:
+        for connection, stamp, _ in reader.messages():
+            kept = {'/image_raw': pictures, '/action': decisions, '/episode': begins}
+            kept.get(connection.topic, []).append(stamp)
+    for first in (begins[0], begins[4]):
+        seen = next(stamp for stamp in pictures if stamp > first)
+        assert seen < next(stamp for stamp in decisions if stamp > first)
+
+
 def test_the_page_is_whole_and_needs_nothing_else(demo):
     page = (demo / 'report.html').read_text()
     assert page.count('<svg') == 2 and page.count('data:image/png') > 10

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import re
 import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
@@ -27,6 +27,7 @@ from vn_nav.evaluation.evaluator import (
     run_episodes,
 )
 from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
+from vn_nav.nodes.isolation import stay_on_this_host
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.report.demo_page import write_report
@@ -36,14 +37,14 @@ from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import house_scene, rooms_of
 
+if TYPE_CHECKING:
+    from vn_nav.nodes.demo_watch import EndedEpisode
+
 TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
 UNSEEN_HOUSE = 8  # seed, of a house with as many rooms as the trained one
 SEED = 2026  # of starts, goals and light
 BASE = 'config/robots/demo_base.yaml'
-HEARS = 60.0  # s until the recorder has met a node
 STALL = 60.0  # s without a finished episode after which the demo gives up
-LINE = re.compile(r'episode (\d+) \((.+)\): (arrived|gave up|stopped elsewhere) after (\d+) '
-                  r'decisions, ([\d.]+) m')
 RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground_truth/odom',
             'action', 'action_names', 'arrived', 'collision', 'reward', 'episode_end', 'episode',
             'episode_result', 'scene', '/diagnostics']
@@ -92,6 +93,7 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
     unseen = house_scene(UNSEEN_HOUSE, rooms_of(trained))
     places = (('trained', trained, episodes, TRAINED_LIMIT),
               ('unseen', unseen, unseen_episodes, UNSEEN_LIMIT))
+    _import_ros()
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     for name in ('bag', 'logs'):
@@ -128,6 +130,16 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
     return 0
 
 
+def _import_ros() -> None:
+    """Import what needs ROS, where ROS stays on this host."""
+    stay_on_this_host()
+    try:
+        import vn_nav.nodes.demo_watch  # noqa: F401
+    except ImportError as error:
+        raise UserError('the demo runs the real nodes, on ROS 2 Jazzy', str(error),
+                        "pip install 'vn_nav[ros]', or source an installed Jazzy") from error
+
+
 def bridge_parameters(checkpoint: LoadedCheckpoint, scene: str, count: int, limit: int) -> dict:
     """What the sim bridge simulates in one scene. `control_env` simulates the same."""
     info = checkpoint.info
@@ -155,47 +167,34 @@ def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, scene: str, co
 def _drive(console: Console, processes: Processes, folder: Path, checkpoint: LoadedCheckpoint,
            place: str, scene: str, count: int, limit: int, start_time: float) -> None:
     """All episodes in one house."""
+    from vn_nav.nodes.demo_watch import DemoWatch
     bridge, policy = f'bridge_{place}', f'policy_{place}'
     note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
     console.print(f'\n[bold]{place} house[/], {scene}{note}')
-    processes.start(policy, 'vn_nav.nodes.policy_node', {
-        'checkpoint': str(folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
-        'auto_enable': True, 'seed': SEED}, (f'__node:={policy}',))
-    # A robot that is where it wants to be at once would be gone before the recorder has met it.
-    _wait_until_heard(processes, policy)
-    processes.start(bridge, 'vn_sim_bridge.bridge_node',
-                    bridge_parameters(checkpoint, scene, count, limit) | {
-                        'time': 'lock_step', 'start_time': start_time, 'exit_when_done': True})
-    seen, progress = 0, time.monotonic()
-    with Live(_progress([], count), console=console, refresh_per_second=8) as live:
-        while True:
-            done = LINE.findall(processes.log(bridge))
-            if len(done) > seen:
-                seen, progress = len(done), time.monotonic()
-            live.update(_progress(done, count))
-            processes.check('recorder')
-            processes.check(policy)
-            processes.check(bridge)
-            if processes.running[bridge].poll() is not None:
-                live.update(_progress(LINE.findall(processes.log(bridge)), count))
-                break
-            if time.monotonic() - progress > STALL:
-                words = (processes.log(policy).strip().splitlines() or ['nothing'])[-1]
-                raise ProcessFailure(f"no episode ended for {STALL:.0f} s; the policy's last "
-                                     f'words: {words}')
-            time.sleep(0.1)
+    with DemoWatch(processes, policy, bridge) as watch:
+        processes.start(policy, 'vn_nav.nodes.policy_node', {
+            'checkpoint': str(folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
+            'seed': SEED}, (f'__node:={policy}',))
+        processes.start(bridge, 'vn_sim_bridge.bridge_node',
+                        bridge_parameters(checkpoint, scene, count, limit) | {
+                            'time': 'lock_step', 'start_time': start_time,
+                            'exit_when_done': True}, (f'__node:={bridge}',))
+        with Live(_progress([], count), console=console, refresh_per_second=8) as live:
+            watch.enable()
+            seen, progress = 0, time.monotonic()
+            while processes.running[bridge].poll() is None:
+                watch.spin(0.1)
+                done = watch.episodes
+                if len(done) > seen:
+                    seen, progress = len(done), time.monotonic()
+                live.update(_progress(done, count))
+                if time.monotonic() - progress > STALL:
+                    raise ProcessFailure(f'no episode ended for {STALL:.0f} s; the policy says: '
+                                         f'{watch.said}')
+            watch.spin(0.5)  # the last result is on its way
+            live.update(_progress(watch.episodes, count))
     processes.stop(policy)
     processes.stop(bridge)
-
-
-def _wait_until_heard(processes: Processes, name: str) -> None:
-    until = time.monotonic() + HEARS
-    while f'hears /{name}\n' not in processes.log('recorder'):
-        for child in ('recorder', name):
-            processes.check(child)
-        if time.monotonic() > until:
-            raise ProcessFailure(f'the recorder has not met {name} within {HEARS:.0f} s')
-        time.sleep(0.05)
 
 
 def _stop(info: dict) -> str:
@@ -203,15 +202,16 @@ def _stop(info: dict) -> str:
     return ARRIVAL if info['stop_threshold'] is None else DECLARED
 
 
-def _progress(done: list[tuple], count: int) -> Table:
+def _progress(done: list[EndedEpisode], count: int) -> Table:
     """The live view: one row an episode, the newest at the bottom."""
     table = Table(box=None, pad_edge=False)
     for heading in ('episode', 'goal', 'outcome', 'decisions', 'metres'):
         table.add_column(heading, justify='left' if heading in ('goal', 'outcome') else 'right')
-    for number, room, outcome, decisions, metres in done[-12:]:
-        colour = 'green' if outcome == 'arrived' else 'yellow'
-        table.add_row(f'{int(number) + 1}/{count}', room, f'[{colour}]{outcome}[/]', decisions,
-                      metres)
+    for episode in done[-12:]:
+        colour = 'green' if episode.outcome == 'arrived' else 'yellow'
+        table.add_row(f'{episode.number + 1}/{count}', episode.goal,
+                      f'[{colour}]{episode.outcome}[/]', str(episode.decisions),
+                      f'{episode.metres:.1f}')
     if len(done) < count:
         table.add_row(f'{len(done) + 1}/{count}', '...', 'driving' if done else 'starting', '', '')
     return table
@@ -228,6 +228,7 @@ def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint) -> dict:
         actor = PolicyActor(env, checkpoint.network, info['decoding'], SEED,
                             STOP_THRESHOLD if stop == ARRIVAL else info['stop_threshold'])
         in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
+        env.close()
         result[place] = figures | {'scene': scene, 'max_decisions': limit, 'stop': stop,
                                    'random': summarise(control),
                                    'without_ros': summarise(in_process),

@@ -13,7 +13,7 @@ import operator
 import sys
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -32,6 +32,7 @@ MESSAGES_PER_TURN = 16  # messages of a topic that are taken before its neighbou
 POLL_PERIOD_S = 0.005  # s between looks at the subscriptions when there was nothing
 GRAPH_PERIOD_S = 0.2  # s between looks at who publishes
 REPORT_PERIOD_S = 1.0  # s
+RECEIVED = 'received: '  # before a topic's name in the status: messages of it
 TWIN = {'geometry_msgs/msg/Twist': 'geometry_msgs/msg/TwistStamped'}  # accepted in its place
 COMPRESSED = 'image_raw/compressed'  # a bag needs a picture once: only where there is no raw one
 
@@ -255,7 +256,7 @@ class RecorderNode(Node):
                 if (info.node_name, info.node_namespace) != me]
 
     def _report(self) -> None:
-        """Say once a second at most what was lost since, and that recording has stopped."""
+        """Say once a second what has come, what was lost since, and that recording has stopped."""
         if self.writer.stopped and not self.stopped:
             self._stop(RecordingStopped(self.writer.folder, self.writer.stopped))
         if self.stopped:
@@ -268,6 +269,8 @@ class RecorderNode(Node):
             self.get_logger().warning(f'{lost - self.lost_said} messages lost in the last second; '
                                       f'so far {words}')
             self._diagnose(DiagnosticStatus.WARN, f'messages lost so far: {words}')
+        else:
+            self._diagnose(DiagnosticStatus.OK, 'recording')
         self.lost_said = lost
 
     def _stop(self, error: RecordingStopped) -> None:
@@ -282,7 +285,9 @@ class RecorderNode(Node):
 
     def _diagnose(self, level: bytes, words: str) -> None:
         message = DiagnosticArray(status=[DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(), message=words)])
+            level=level, name=self.get_fully_qualified_name(), message=words,
+            values=[KeyValue(key=f'{RECEIVED}{tap.topic.name}', value=str(tap.received))
+                    for tap in self.taps.values() if tap.received])])
         message.header.stamp = self.get_clock().now().to_msg()
         self.diagnostics.publish(message)
 
