@@ -13,8 +13,8 @@ from small_bags import IMAGE, START, drive, picture, write
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags import dataset
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import NO_ACTION
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.storage.reader import read_bag
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess, preprocess_map

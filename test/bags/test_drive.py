@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from vn_msgs_py.motion import yaw_to_quaternion
-from vn_nav.bags.drive import NO_ACTION, ActionSegmenter, Report, integrate, synchronise
+from vn_nav.bags.drive import Report, synchronise
 from vn_nav.bags.drive import TimestampedMessage as Message
+from vn_nav.bags.poses import integrate
 from vn_nav.bags.roles import TYPES, Topics, full_name, load_topics
+from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter
 from vn_nav.bags.stamped import Stamped
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec

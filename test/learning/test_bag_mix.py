@@ -9,7 +9,7 @@ import torch
 from round_room import ROBOT, drive_set
 from small_bags import FIXTURE
 
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.cli import main
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.learning.bag_mix import WINDOW, BagMix, _Endless

@@ -8,7 +8,7 @@ from round_room import ROBOT, drive_set, look
 
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.bags.dataset import DriveSet
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.co_visibility import co_visible, lift
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import (

@@ -23,8 +23,8 @@ from small_bags import FIXTURE, IMAGE, ODOMETRY, START, drive, make, odometry, w
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import NO_ACTION
 from vn_nav.bags.roles import Topics, load_topics
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.shadow.compare import (
     Answer,
     Shadow,

@@ -19,17 +19,9 @@ import numpy as np
 
 from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
-from vn_nav.bags.drive import (
-    NO_ACTION,
-    ActionSegmenter,
-    Frame,
-    Report,
-    Step,
-    find_topics,
-    hear,
-    synchronise,
-)
+from vn_nav.bags.drive import Frame, Report, find_topics, hear, synchronise
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter, Step
 from vn_nav.bags.storage.bag_files import files_of
 from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.errors import UserError
@@ -76,7 +68,7 @@ class DriveSet:
     image: Pictures  # [N,3,S,S] uint8
     pose: np.ndarray  # [N,3] float64 x, y [m], yaw [rad] in the frame of the odometry
     time: np.ndarray  # [N] float64 s, stamps
-    action: np.ndarray  # [N] int16, that begins here; `drive.NO_ACTION`: none, or the end
+    action: np.ndarray  # [N] int16, that begins here; `segmenter.NO_ACTION`: none, or the end
     episode: np.ndarray  # [N] int64
     goal: np.ndarray  # [N] int64 into goals, -1: no goal was shown
     goals: np.ndarray  # [G,3,S,S] uint8

@@ -14,7 +14,7 @@ import numpy as np
 
 from vn_nav.arrival import arrived, heading_error
 from vn_nav.bags.dataset import MAX_DEPTH
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.co_visibility import co_visible, co_visible_by_poses, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec

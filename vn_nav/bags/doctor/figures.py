@@ -10,7 +10,7 @@ import statistics
 
 import numpy as np
 
-from vn_nav.bags.drive import COMMAND_TIMEOUT_S
+from vn_nav.bags.poses import COMMAND_TIMEOUT_S
 from vn_nav.bags.stamped import PAIRING_TIMEOUT_S
 from vn_nav.bags.storage.stream import Connection
 

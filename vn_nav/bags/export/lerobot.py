@@ -24,16 +24,9 @@ from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav import __version__
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.drive import (
-    COMMAND_TIMEOUT_S,
-    Frame,
-    Report,
-    TimestampedMessage,
-    find_topics,
-    hear,
-    synchronise,
-)
+from vn_nav.bags.drive import Frame, Report, TimestampedMessage, find_topics, hear, synchronise
 from vn_nav.bags.export.lerobot_stats import Colours, describe, merge
+from vn_nav.bags.poses import COMMAND_TIMEOUT_S
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.stamped import set_back
 from vn_nav.errors import UserError

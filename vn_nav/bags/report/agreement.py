@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import NO_ACTION
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:  # it takes torch along

@@ -10,10 +10,11 @@ import numpy as np
 
 from vn_nav import __version__
 from vn_nav.bags.doctor.figures import ERROR, Finding, TopicFigures
-from vn_nav.bags.drive import ACTION_LENGTH_TOLERANCE, COMMAND_TIMEOUT_S
+from vn_nav.bags.poses import COMMAND_TIMEOUT_S
 from vn_nav.bags.report.agreement import END, OTHER, STOP, Agreement, Disagreement, Judged
 from vn_nav.bags.report.figures import MAX_STRIP_PICTURES, Shot, Timeline
 from vn_nav.bags.report.show import AXES, Shown
+from vn_nav.bags.segmenter import ACTION_LENGTH_TOLERANCE
 from vn_nav.report.chart import Line, Series, Shape, Text, legend, panel, ticks, to_svg
 from vn_nav.report.page import CURVES, cards, page, picture, table
 

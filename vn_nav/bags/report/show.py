@@ -17,18 +17,11 @@ import numpy as np
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.doctor.figures import Diagnosis
-from vn_nav.bags.drive import (
-    ActionSegmenter,
-    Frame,
-    Report,
-    TimestampedMessage,
-    find_topics,
-    hear,
-    synchronise,
-)
+from vn_nav.bags.drive import Frame, Report, TimestampedMessage, find_topics, hear, synchronise
 from vn_nav.bags.report.agreement import Agreement, judge
 from vn_nav.bags.report.figures import Film, Goals, Odometer, Shot, Timeline, Ways
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import ActionSegmenter
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:  # it takes torch along
