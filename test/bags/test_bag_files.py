@@ -21,9 +21,10 @@ from rosbags.typesys import Stores, get_typestore
 from small_bags import STORE, STRING, drive, make, serialised, write
 
 from vn_nav import cli
-from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.doctor.recover import recover
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.storage.stream import Bag, BagError, messages, summary
 from vn_nav.robot import RobotSpec
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.cli.options import command_words, parse_changes
 from vn_nav.learning.presets import PRESETS
+from vn_nav.learning.pretrain_config import PretrainConfig
 from vn_nav.learning.pretrain_job import PretrainJob, pretrain
-from vn_nav.learning.pretraining import PretrainConfig
 from vn_nav.learning.supervised import PARTS
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives, draw_windows, partners, rows_of
 from vn_nav.learning.presets import TrainConfig
-from vn_nav.learning.pretraining import PretrainConfig, choose_parts
+from vn_nav.learning.pretrain_config import PretrainConfig, choose_parts
 from vn_nav.learning.rollout import Rollout
 from vn_nav.learning.supervised import NEEDS, Batch, Objective, Tally
 from vn_nav.policy.network import Policy

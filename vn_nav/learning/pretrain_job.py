@@ -13,15 +13,17 @@ from typing import Any
 
 import torch
 
-from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
+from vn_nav.bags.dataset import DriveSet, Wanted
 from vn_nav.bags.drive import RECORDED
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.mapping.recorded_place import scene_of
 from vn_nav.bags.roles import Topics
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split
 from vn_nav.learning.precision import fast_dtype
 from vn_nav.learning.presets import TrainConfig, preset
-from vn_nav.learning.pretraining import PretrainConfig, choose_parts, pretrain_network
+from vn_nav.learning.pretrain_config import PretrainConfig, choose_parts
+from vn_nav.learning.pretraining import pretrain_network
 from vn_nav.learning.supervised import PARTS
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.policy.network import Policy

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
+from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted
 from vn_nav.bags.drive import RECORDED
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.mapping.loop_closure import ROUNDS, straighten
 from vn_nav.bags.mapping.one_place import Part, check_frame, check_place, choose, parse_pictures
 from vn_nav.bags.roles import Topics

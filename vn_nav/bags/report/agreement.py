@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
+from vn_nav.bags.dataset import DriveSet, Wanted
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.robot import RobotSpec
