@@ -13,7 +13,7 @@ import numpy as np
 from vn_nav.bags.continuity import Break, divide, find_breaks
 from vn_nav.bags.dataset import DriveSet
 from vn_nav.bags.mapping.loop_closure import OptimisedOdometry
-from vn_nav.bags.mapping.pose_graph import GATE
+from vn_nav.bags.mapping.pose_graph import MAX_CHI2
 from vn_nav.errors import UserError
 
 RANGES = re.compile(r'\d+-\d+(,\d+-\d+)*')
@@ -131,7 +131,7 @@ def check_place(part: Part, found: OptimisedOdometry) -> None:
             reasons.insert(found.stretch[k], 'from here on no picture matches the earlier '
                            'pictures at the same poses')
         _refuse(part, found.stretch, found.place, reasons, '')
-    if found.facts['strain'] > GATE:
+    if found.facts['strain'] > MAX_CHI2:
         k = found.facts['strained']
         raise UserError(
             'odometry agrees with the loop closures', f'they contradict each other after '
