@@ -25,7 +25,8 @@ def add_place_options(parser: argparse.ArgumentParser) -> None:
                         'shows twice (docs/bags.md)')
     parser.add_argument('--pictures', metavar='A-B[,C-D]', help='numbers of those to learn from; '
                         'several ranges: you vouch for their odometry being in one frame')
-    parser.add_argument('--goals', type=int, default=MAX_GOALS, help='pictures to drive to, at most')
+    parser.add_argument('--goals', type=int, default=MAX_GOALS,
+                        help='pictures to drive to, at most')
     parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags; '
                         'default: `decoded` in the folder of a run, or none')
 
