@@ -41,7 +41,7 @@ def tasks_table(tasks: list[str]):
                 'metadata': None} for name, kind, numpy in (
                     ('task_index', 'int64', 'int64'), ('task', 'unicode', 'object'))]
     pandas = {'index_columns': ['task'], 'column_indexes': [], 'columns': columns,
-            'creator': {'library': 'pyarrow', 'version': pyarrow.__version__},
-            'pandas_version': None}
+              'creator': {'library': 'pyarrow', 'version': pyarrow.__version__},
+              'pandas_version': None}
     table = pyarrow.table({'task_index': np.arange(len(tasks)), 'task': tasks})
     return table.replace_schema_metadata({'pandas': json.dumps(pandas)})

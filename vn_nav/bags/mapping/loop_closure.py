@@ -62,7 +62,7 @@ def optimise_odometry(drives: DriveSet, robot: RobotSpec, pictures: Pictures | N
         The poses; as odometry has them where too little was recognised (`facts['corrected']`).
     """
     drive = DriveGraph(drives, robot, drives.image if pictures is None else pictures, stretch,
-                   lambda share: show(FEATURE_TIME_SHARE * share))
+                       lambda share: show(FEATURE_TIME_SHARE * share))
     found = LoopClosures(drive)
     solution = solve(drive.odometry[drive.node], drive.edges, found.edges())
     rounds = 0

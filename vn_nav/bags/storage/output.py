@@ -153,7 +153,7 @@ class McapOutput:
         stamps += last.span or ()
         counts = tuple((channel, len(index.records)) for channel, index in indexes.items())
         self._append(written, Part(span=(min(stamps), max(stamps)), declared=tuple(declared),
-                                    index=builder.end(), counts=counts))
+                                   index=builder.end(), counts=counts))
         self.counts.update(dict(counts))
 
     def sync(self) -> None:
