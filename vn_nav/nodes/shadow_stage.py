@@ -23,7 +23,7 @@ from vn_msgs_py.topics import Topic, topic
 from vn_nav.bags.shadow.plan import STAMP_RESOLUTION_NS, Decision, Event, Plan, stamped
 from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
-from vn_nav.nodes.policy_node import SHADOW_LIMIT
+from vn_nav.nodes.policy_node import SHADOW_LIMIT_S
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.nodes.qos import qos
@@ -183,8 +183,8 @@ class Stage:
         self._show(event.picture_data, stamp)
         self._until(lambda: self._choice is not None, 'a decision', resend=True)
         self.latencies.append(time.monotonic() - begun)
-        if self.latencies[-1] > SHADOW_LIMIT:  # the node has discarded it
-            raise UserError(f'a decision takes less than {SHADOW_LIMIT:g} s',
+        if self.latencies[-1] > SHADOW_LIMIT_S:  # the node has discarded it
+            raise UserError(f'a decision takes less than {SHADOW_LIMIT_S:g} s',
                             f'{self.latencies[-1]:.1f} s',
                             'try again when the machine is less busy')
         if self._rests and not self._has_arrived:
