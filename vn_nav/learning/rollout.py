@@ -19,8 +19,9 @@ from torch import Tensor
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.action_filter import make_filter
+from vn_nav.policy.goal_maps import GoalMaps
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import GoalMaps, Policy
+from vn_nav.policy.network import Policy
 from vn_nav.policy.zhu import check_scenes
 from vn_nav.policy.zhu_policy import ScenePolicy
 from vn_nav.vector_env import NavigationVectorEnv, PlacedEnv
