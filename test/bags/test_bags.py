@@ -402,7 +402,7 @@ def test_a_full_disk_and_one_below_the_limit_leave_a_whole_bag(reserve, tmp_path
 def test_losses_are_counted_between_the_numbers_of_publishers():
     def lost(numbers, publishers=1):
         losses = Losses()
-        return sum(losses.hear(number, publishers) for number in numbers)
+        return sum(losses.add(number, publishers) for number in numbers)
     assert lost(range(5, 100)) == 0, "what was before the first is nobody's loss"
     assert lost([1, 2, 5, 6, 10]) == 5
     assert lost([7, 8, 9, 1, 2, 3, 5]) == 1, 'a publisher that was started again'

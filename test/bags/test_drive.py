@@ -308,7 +308,7 @@ def test_what_is_held_of_depth_is_bounded():
     rows = Stamped()
     for take in range(5):
         for t in np.arange(0.0, 20.0, 0.05):
-            rows.hear(t, 30.0 * take + t, None)
+            rows.add(t, 30.0 * take + t, None)
             assert sum(len(run.stamps) for run in rows._runs) <= 3 * 41
 
 

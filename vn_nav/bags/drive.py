@@ -36,7 +36,7 @@ def find_topics(bag: str | Path, wanted: Topics) -> Topics:
     return wanted.within({name: topic.type for name, topic in summary(bag).items()})
 
 
-def hear(bag: str | Path, topics: Topics) -> Iterator[TimestampedMessage]:
+def timestamped_messages(bag: str | Path, topics: Topics) -> Iterator[TimestampedMessage]:
     """The messages of a drive in the order of recording, one take after the other.
 
     Args:
@@ -110,7 +110,7 @@ def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: 
         report: is filled.
     """
     track = OdometryPoses() if topics.odometry else DeadReckoning()
-    beside = {name: Stamped() for name in (topics.depth, topics.labels) if name}
+    maps = {name: Stamped() for name in (topics.depth, topics.labels) if name}
     waiting: collections.deque[tuple[float, float, Any, int, Any]] = collections.deque()
     episode, goal, goal_stamp = 0, None, None
     newest = -math.inf  # s, of recording
@@ -119,7 +119,7 @@ def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: 
         if topic in (topics.image, topics.odometry or topics.command):
             if set_back(time, newest):  # another take: nothing more comes of the one before
                 while waiting:
-                    last = yield from _settle(waiting.popleft(), track, beside, topics, last,
+                    last = yield from _settle(waiting.popleft(), track, maps, topics, last,
                                               report)
                 newest = time
             newest = max(newest, time)
@@ -129,11 +129,11 @@ def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: 
         elif topic in (topics.odometry, topics.command):
             if topic == (topics.odometry or topics.command):
                 try:
-                    track.hear(message, time)
+                    track.add(message, time)
                 except MotionError:
                     report.bad += 1
-        elif topic in beside:
-            beside[topic].hear(_stamp(message, time), time, message)
+        elif topic in maps:
+            maps[topic].add(_stamp(message, time), time, message)
         elif topic == topics.episode_end:
             episode += 1
         elif topic == topics.goal:
@@ -142,14 +142,14 @@ def synchronise(messages: Iterable[TimestampedMessage], topics: Topics, report: 
                 episode += 1
             goal, goal_stamp = message, stamp
         while waiting and (track.knows(waiting[0][0]) and all(
-                rows.reaches(waiting[0][0]) for rows in beside.values())
+                rows.reaches(waiting[0][0]) for rows in maps.values())
                 or waiting[0][1] < time - PAIRING_TIMEOUT_S):
-            last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
+            last = yield from _settle(waiting.popleft(), track, maps, topics, last, report)
     while waiting:
-        last = yield from _settle(waiting.popleft(), track, beside, topics, last, report)
+        last = yield from _settle(waiting.popleft(), track, maps, topics, last, report)
 
 
-def _settle(picture, track, beside, topics: Topics, last: Frame | None, report: Report):
+def _settle(picture, track, maps, topics: Topics, last: Frame | None, report: Report):
     """Yield a picture's frame, if it has one; the last frame that there was."""
     stamp, time, message, episode, goal = picture
     pose = track.pose(stamp, time)
@@ -160,7 +160,7 @@ def _settle(picture, track, beside, topics: Topics, last: Frame | None, report: 
     if last is not None and stamp <= last.stamp and not back and episode == last.announced:
         report.unordered += 1
         return last
-    own = {role: beside[name].nearest(stamp, time) for role, name in (
+    own = {role: maps[name].nearest(stamp, time) for role, name in (
         ('depth', topics.depth), ('labels', topics.labels)) if name}
     number = 0
     if last is not None:

@@ -19,7 +19,7 @@ import numpy as np
 from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_nav.bags.dataset import MAX_DEPTH, Wanted
-from vn_nav.bags.drive import Frame, Report, find_topics, hear, synchronise
+from vn_nav.bags.drive import Frame, Report, find_topics, synchronise, timestamped_messages
 from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter, Step
 from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.errors import UserError
@@ -64,7 +64,7 @@ def read_steps(bag: str | Path, wanted: Wanted, report: Report) -> tuple[Iterato
     fov = _field_of_view(bag, topics.camera_info)
     if fov is not None:
         crop_fraction(fov, wanted.robot.camera_fov)  # or says that the camera is too narrow
-    frames = synchronise(hear(bag, topics), topics, report)
+    frames = synchronise(timestamped_messages(bag, topics), topics, report)
     steps = (_each(frames) if wanted.every else ActionSegmenter(wanted.robot, report).cut(frames))
     return steps, {'topics': dataclasses.asdict(topics), 'fov': fov}
 

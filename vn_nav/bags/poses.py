@@ -21,9 +21,9 @@ class OdometryPoses:
     def __init__(self):
         self._received = Stamped()
 
-    def hear(self, message: Any, time: float) -> None:
+    def add(self, message: Any, time: float) -> None:
         values = odometry_to_array(message)
-        self._received.hear(values[6] or time, time, values[:3])
+        self._received.add(values[6] or time, time, values[:3])
 
     def knows(self, stamp: float) -> bool:
         return self._received.reaches(stamp)
@@ -51,7 +51,7 @@ class DeadReckoning:
         self._at: float | None = None  # time of the pose
         self._past: collections.deque[tuple[float, np.ndarray]] = collections.deque()
 
-    def hear(self, message: Any, time: float) -> None:
+    def add(self, message: Any, time: float) -> None:
         velocity = twist_to_array(message)[:3]
         self._advance(time)
         self._velocity, self._from = velocity, time

@@ -60,7 +60,7 @@ class DecisionWorker:
             node.create_publisher(kind, name, qos(name)) for kind, name in (
                 (Int8, 'action'), (String, 'action_names'), (Bool, 'arrived'))]
         names.publish(String(data=json.dumps(list(runtime.action_names))))
-        self.tell_arrival()
+        self.publish_arrival()
 
     def show_frame(self, message, stamp: float, received: float) -> None:
         """The newest admitted picture; one before it that still waits is dropped.
@@ -80,7 +80,7 @@ class DecisionWorker:
             self._goal = message
             self._wake.notify_all()
 
-    def tell(self, stamp: float, action: str | None) -> None:
+    def note_executed(self, stamp: float, action: str | None) -> None:
         """What the robot really did before the picture of a stamp, where a decision is wanted.
 
         Args:
@@ -122,7 +122,7 @@ class DecisionWorker:
         if self.camera_fov is not None:
             crop_fraction(self.camera_fov, self._runtime.camera_fov)
 
-    def tell_arrival(self, *, again: bool = False) -> None:
+    def publish_arrival(self, *, again: bool = False) -> None:
         """Publish whether the robot stands where the policy has arrived, when that changed.
 
         Args:
@@ -161,7 +161,7 @@ class DecisionWorker:
                 stamp = message.header.stamp
                 self._navigator.accept_goal(stamp.sec + stamp.nanosec * 1e-9 if self._lock_step
                                             else -math.inf)
-                self.tell_arrival(again=True)
+                self.publish_arrival(again=True)
 
     def _refuse_goal(self, why: str) -> None:
         self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
@@ -199,7 +199,7 @@ class DecisionWorker:
             self.inferences.add(now, now - begun)
             if self._runtime.arrived:
                 self._navigator.declared(ticket, self._runtime.arrival, now)
-                self.tell_arrival()
+                self.publish_arrival()
             else:
                 # Still holding the lock: whoever hears of it finds it decided, and no command for
                 # it is out yet.

@@ -169,7 +169,7 @@ class PolicyNode(LifecycleNode):
         ended = self.halt('deactivated')
         with self._wake:
             self.navigator.reset()
-            self._worker.tell_arrival()
+            self._worker.publish_arrival()
         self._operation.diagnose()
         done = super().on_deactivate(state)
         return done if ended else TransitionCallbackReturn.ERROR

@@ -67,7 +67,7 @@ class Operation:
             else:
                 self._navigator.disable()
                 response.success, response.message = True, 'disabled'
-            self._worker.tell_arrival()
+            self._worker.publish_arrival()
             self._wake.notify_all()
         self.diagnose()
         return response
@@ -80,7 +80,7 @@ class Operation:
         if not self._node.has_clock():
             blockers.append('use_sim_time is set and nothing has come on /clock: start the '
                             'simulator, or set use_sim_time to false')
-        blockers += self._inputs.unheard()
+        blockers += self._inputs.unreceived()
         if self._output.odometry is None:
             if self._lock_step:
                 blockers.append('no odometry: lock_step answers each message on odom')
@@ -100,7 +100,7 @@ class Operation:
     def _on_stop(self, _request, response):
         with self._wake:
             self._navigator.stop('~/stop was called', time.monotonic())
-            self._worker.tell_arrival()
+            self._worker.publish_arrival()
             self._wake.notify_all()
         response.success, response.message = True, 'stopped: ~/reset, then ~/enable to go on'
         return response
@@ -108,7 +108,7 @@ class Operation:
     def _on_reset(self, _request, response):
         with self._wake:
             self._navigator.reset()
-            self._worker.tell_arrival()
+            self._worker.publish_arrival()
             self._wake.notify_all()
         response.success, response.message = True, 'ready: ~/enable to go on'
         return response
@@ -123,7 +123,7 @@ class Operation:
                                          time.monotonic())
                 elif self._auto_enable and self._navigator.state is State.IDLE:
                     self._enable()
-                self._worker.tell_arrival()
+                self._worker.publish_arrival()
                 self._wake.notify_all()
         self.diagnose()
 

@@ -107,7 +107,8 @@ class RosRobot(Node):
     def _make_interfaces(self) -> None:
         self._action, names = (self.create_publisher(kind, name, qos(name)) for kind, name in (
             (Int8, 'action'), (String, 'action_names')))
-        self._topics.say(names, 'action_names', String(data=json.dumps(self.robot.action_names)))
+        self._topics.publish(names, 'action_names',
+                             String(data=json.dumps(self.robot.action_names)))
         self._topics.record_own(self.output.publisher, 'cmd_vel')
         self.create_service(Trigger, '~/stop', self._on_stop)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -115,11 +116,11 @@ class RosRobot(Node):
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def listen(self, keys: tuple[str, ...]) -> None:
-        """Have these keys of `BESIDE` beside every picture."""
+        """Have the maps of these keys of `MAP_TOPICS` with every picture."""
         self._senses.listen(keys)
 
     def offers(self) -> set[str]:
-        """The keys of `BESIDE` that somebody publishes."""
+        """The keys of `MAP_TOPICS` that somebody publishes."""
         return self._senses.offers()
 
     @property
@@ -209,7 +210,7 @@ class RosRobot(Node):
         with self.wake:
             self.wake.notify_all()
         self._decisions += 1
-        self._topics.say(self._action, 'action', Int8(data=action))
+        self._topics.publish(self._action, 'action', Int8(data=action))
 
     def finish(self) -> Outcome:
         """Wait until the motion is over and seen: what came of it."""
@@ -226,18 +227,18 @@ class RosRobot(Node):
                     or time.monotonic() - at_rest > JUDGE_TIMEOUT_S)
         self._readiness.wait_until(over)
         with self.wake:
-            said, self._senses.tally = self._senses.tally, Tally()
+            tally, self._senses.tally = self._senses.tally, Tally()
             elsewhere = self._senses.goals != self._episode_goal
             cut = self.navigator.cut_off != self._cut_before
             seen = self._shown if elsewhere else self._senses.look()
         assert seen is not None  # the decision was made at a picture
-        success = said.reward > 0 or said.arrived
-        terminated = success or said.end == TERMINATED
+        success = tally.reward > 0 or tally.arrived
+        terminated = success or tally.end == TERMINATED
         limit = self._decisions >= self.max_decisions and not self.count_publishers('episode_end')
-        truncated = not terminated and (said.end == TRUNCATED or elsewhere or cut or limit)
-        self._awaits_goal = terminated or said.end == TRUNCATED
+        truncated = not terminated and (tally.end == TRUNCATED or elsewhere or cut or limit)
+        self._awaits_goal = terminated or tally.end == TRUNCATED
         self._shown = seen
-        return Outcome(seen, said.reward or float(said.arrived), success, said.collided,
+        return Outcome(seen, tally.reward or float(tally.arrived), success, tally.collided,
                        terminated, truncated, stale=elsewhere)
 
     def halt(self) -> None:

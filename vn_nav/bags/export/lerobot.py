@@ -22,7 +22,14 @@ from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav import __version__
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.drive import Frame, Report, TimestampedMessage, find_topics, hear, synchronise
+from vn_nav.bags.drive import (
+    Frame,
+    Report,
+    TimestampedMessage,
+    find_topics,
+    synchronise,
+    timestamped_messages,
+)
 from vn_nav.bags.export.lerobot_files import Table, Video
 from vn_nav.bags.export.lerobot_layout import (
     ACTION,
@@ -153,7 +160,7 @@ class _Dataset:
         return 'commanded' if self._topics.command else 'measured (no commands were recorded)'
 
     def _messages(self, bag: str | Path) -> Iterator[TimestampedMessage]:
-        for m in hear(bag, self._topics):
+        for m in timestamped_messages(bag, self._topics):
             try:
                 if m.topic == self._topics.command:
                     self._commands.add(m.time, twist_to_array(m.message)[:3])

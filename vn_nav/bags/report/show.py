@@ -17,7 +17,14 @@ import numpy as np
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.doctor.figures import Diagnosis
-from vn_nav.bags.drive import Frame, Report, TimestampedMessage, find_topics, hear, synchronise
+from vn_nav.bags.drive import (
+    Frame,
+    Report,
+    TimestampedMessage,
+    find_topics,
+    synchronise,
+    timestamped_messages,
+)
 from vn_nav.bags.report.agreement import Agreement, judge
 from vn_nav.bags.report.figures import Film, Goals, Odometer, Shot, Timeline, Ways
 from vn_nav.bags.roles import Topics
@@ -92,7 +99,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
 
 def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[TimestampedMessage]:
     """The messages of a drive; velocities are noted as they pass."""
-    for m in hear(bag, names):
+    for m in timestamped_messages(bag, names):
         kind = {names.command: 'commanded', names.odometry: 'measured'}.get(m.topic)
         if kind is not None:
             try:
