@@ -1,4 +1,4 @@
-"""Bags to training batches: frames a second, beside what others offer.
+"""Bags to training batches: frames a second, compared with what others offer.
 
     python bench/bags.py --rounds 5
 

@@ -93,7 +93,7 @@ class Stamped:
 
         Args:
             stamp: of a picture [s].
-            time: when it was recorded [s], which tells apart two takes with the same stamps.
+            time: when it was recorded [s], which distinguishes two takes with the same stamps.
         """
         found = self._near(stamp, time)
         return None if found is None else found[1]

@@ -73,7 +73,7 @@ def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
         except (ValueError, SyntaxError):
             changes[name] = value
         if isinstance(known[name], str):
-            changes[name] = value  # a word, whatever it looks like
+            changes[name] = value  # a text, whatever it looks like
     return changes
 
 
@@ -85,6 +85,6 @@ def check_folders(*files: Path | None) -> None:
                             'make the folder, or choose another place')
 
 
-def command_words() -> str:
+def command_line() -> str:
     """This command as somebody would repeat it."""
-    return 'vn_nav ' + shlex.join(word for word in sys.argv[1:] if word != '--resume')
+    return 'vn_nav ' + shlex.join(part for part in sys.argv[1:] if part != '--resume')

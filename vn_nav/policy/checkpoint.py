@@ -37,7 +37,7 @@ from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.zhu_policy import build_policy
 
-HEADER_BYTES = 1_000_000  # of a safetensors file, beside its weights
+HEADER_BYTES = 1_000_000  # of a safetensors file, without its weights
 MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
 
 

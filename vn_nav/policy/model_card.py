@@ -48,26 +48,26 @@ def model_card(config: dict, parameters: int, size: int) -> str:
 
 
 def _describe(network: dict) -> str:
-    """The network in words."""
+    """A short description of the network."""
     if network['architecture'] == 'icra2017':
         frozen = {'': 'the small random encoder', 'resnet50': 'ResNet-50'}[network['frozen']]
         return (f'Zhu et al. 2017 on frozen features of {frozen}; {network["frames"]} stacked '
                 f'frames; layers for {network["scenes"]} scene{"s" * (network["scenes"] > 1)}')
-    words = {'thesis': "the thesis's two streams", 'unreal': "UNREAL's single stream",
-             'fused': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
-                      f'goal fused in the first; {network["features"]} features',
-             'matching': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
-                         'goal compared place by place (correlation volume); '
-                         f'{network["features"]} features'}[
-        network['architecture']]
+    convolutions = f'convolutions {" / ".join(map(str, network["channels"]))}, picture and goal'
+    features = f'{network["features"]} features'
+    parts = [{'thesis': "the thesis's two streams", 'unreal': "UNREAL's single stream",
+              'fused': f'{convolutions} fused in the first; {features}',
+              'matching': f'{convolutions} compared place by place (correlation volume); '
+                          f'{features}'}[network['architecture']]]
     if network['blocks']:
-        words += f'; {network["blocks"]} residual block(s) a stage'
+        parts.append(f'{network["blocks"]} residual block(s) a stage')
     if network.get('moves'):
-        words += '; the goal tracked by dead reckoning'
-    words += (f'; {network["frames"]} stacked frames' if network['frames'] > 1
-              else f'; LSTM {network["hidden"]}')
-    heads = ', '.join(network['heads']).replace('_', ' ')
-    return words + (f'; heads {heads}' if heads else '')
+        parts.append('the goal tracked by dead reckoning')
+    parts.append(f'{network["frames"]} stacked frames' if network['frames'] > 1
+                 else f'LSTM {network["hidden"]}')
+    if network['heads']:
+        parts.append(f'heads {", ".join(network["heads"]).replace("_", " ")}')
+    return '; '.join(parts)
 
 
 def _results_table(results: dict) -> list[str]:

@@ -157,7 +157,7 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
     """Normal equations of a step."""
     size = 3 * len(poses)
     blocks, slope = np.zeros((len(poses), 3, len(poses), 3)), np.zeros((len(poses), 3))
-    beside, down = np.zeros((len(poses), 3, 3)), np.zeros(size + 3)
+    shared, down = np.zeros((len(poses), 3, 3)), np.zeros(size + 3)
     information = np.zeros((size + 3, size + 3))
     for edges, acts, trust in ((odometry, ODOMETRY_SHARES, 1.0),
                                (closures, CLOSURE_SHARES, weight[:, None, None])):
@@ -168,7 +168,7 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
         for node, by in sides:
             left = by.transpose(0, 2, 1) @ inverse
             np.add.at(slope, node, -(left @ error[..., None])[..., 0])
-            np.add.at(beside, node, left @ by_shares)
+            np.add.at(shared, node, left @ by_shares)
             for node2, by2 in sides:
                 # NumPy's annotations know no slice among the indices of `at`.
                 np.add.at(blocks, (node, slice(None), node2),  # type: ignore[arg-type]
@@ -178,7 +178,7 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
         information[size:, size:] += (left @ by_shares).sum(axis=0)
     blocks[0, :, 0] += FIRST_POSE_INFORMATION * np.eye(3)
     information[:size, :size] = blocks.reshape(size, size)
-    information[:size, size:] = beside.reshape(size, 3)
+    information[:size, size:] = shared.reshape(size, 3)
     information[size:, :size] = information[:size, size:].T
     information[size:, size:] += np.diag(prior)
     down[:size] = slope.reshape(-1)

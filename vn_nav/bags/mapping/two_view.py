@@ -2,7 +2,7 @@
 
 The robot drives on a floor and its camera is level but for a known pitch, so three numbers relate
 two pictures: where the second robot stands, seen by the first, and where it looks. A point of the
-first picture is a direction and a depth, which a depth picture tells, or else only what is common
+first picture is a direction and a depth, which a depth picture gives, or else only what is common
 indoors: then the length of a motion is hardly known, its direction and the heading are.
 """
 

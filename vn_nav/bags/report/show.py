@@ -34,7 +34,7 @@ from vn_nav.robot import RobotSpec
 if TYPE_CHECKING:  # it takes torch along
     from vn_nav.policy.checkpoint import LoadedCheckpoint
 
-RATES, VELOCITIES = 0.5, 0.05  # s: the shortest interval of either
+MIN_RATE_INTERVAL_S, MIN_VELOCITY_INTERVAL_S = 0.5, 0.05  # s: the shortest interval of either
 AXES = ('vx', 'vy', 'wz')
 
 
@@ -67,12 +67,12 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
         checkpoint: a policy to ask what it would have done.
 
     Raises:
-        UserError: no readable bag, one without a camera or anything that tells motion, or (with
+        UserError: no readable bag, one without a camera or anything that shows motion, or (with
             a checkpoint) a camera that is too narrow or no usable picture.
     """
     # Depth and labels are not shown; without them no picture waits for any.
     names = find_topics(bag, dataclasses.replace(topics, depth='', labels=''))
-    rates, velocities = Timeline(RATES), Timeline(VELOCITIES)
+    rates, velocities = Timeline(MIN_RATE_INTERVAL_S), Timeline(MIN_VELOCITY_INTERVAL_S)
     diagnosis = diagnose(bag, topics=topics, listen=lambda message: rates.add(
         message.connection.topic, message.log_time))
     velocities.origin = rates.origin  # one axis of time on the whole page

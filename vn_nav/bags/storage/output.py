@@ -35,10 +35,10 @@ from mcap.records import (
 
 from vn_nav.bags.storage.file_parts import FileParts, Part
 
-CHUNK = 256 * 1024  # bytes of records, or one message if that is larger
-LEVEL = 1  # of zstd
+CHUNK_BYTES = 256 * 1024  # bytes of records, or one message if that is larger
+ZSTD_LEVEL = 1  # of zstd
 MAGIC = b'\x89MCAP0\r\n'
-MESSAGE_HEAD = 31  # bytes of a message's record before its data
+MESSAGE_HEAD_BYTES = 31  # bytes of a message's record before its data
 
 
 class McapOutput:
@@ -60,7 +60,7 @@ class McapOutput:
         self._parts = FileParts(path.parent)
         self._known: list[Schema | Channel] = []  # in the parts
         self._chunks = 0
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
         self._schemas: dict[tuple[str, str, bytes], int] = {}  # ids
         self._channels = 0
         self._begin_chunk()
@@ -118,14 +118,14 @@ class McapOutput:
             sequence: number that its publisher gave it.
             published: ns since 1970; None: as `stamp`.
         """
-        if self._index and self._chunk.count + MESSAGE_HEAD + len(data) > CHUNK:
+        if self._index and self._chunk.count + MESSAGE_HEAD_BYTES + len(data) > CHUNK_BYTES:
             self.flush()
         index = self._index.setdefault(channel, MessageIndex(channel_id=channel, records=[]))
         index.records.append((stamp, self._chunk.count))
         Message(channel_id=channel, log_time=stamp, data=data,
                 publish_time=stamp if published is None else published,
                 sequence=sequence & 0xFFFFFFFF).write(self._chunk)
-        if self._chunk.count >= CHUNK:
+        if self._chunk.count >= CHUNK_BYTES:
             self.flush()
 
     def flush(self) -> None:
@@ -265,7 +265,7 @@ class McapOutput:
         for part in self._parts:
             at, crc = at + len(part.index), zlib.crc32(part.index, crc)
             builder.write(part.index)
-            if builder.count >= CHUNK:
+            if builder.count >= CHUNK_BYTES:
                 yield builder.end()
         yield builder.end()
         if at > begin:

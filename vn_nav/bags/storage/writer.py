@@ -20,7 +20,7 @@ from vn_nav.bags.storage.metadata import (
     metadata_text,
     qos_text,
 )
-from vn_nav.bags.storage.output import CHUNK, McapOutput
+from vn_nav.bags.storage.output import CHUNK_BYTES, McapOutput
 from vn_nav.errors import UserError
 
 FLUSH_PERIOD_S = 1.0  # s between flushes: what a power cut may cost
@@ -68,7 +68,7 @@ class BagWriter:
                  max_seconds: float = 0.0, min_free: int = MIN_FREE_BYTES):
         self.folder = Path(folder)
         self._max_bytes, self._max_seconds, self._min_free = max_bytes, max_seconds, min_free
-        self.stopped = ''  # why, in words
+        self.stopped = ''  # why; empty: it goes on
         # By name in the bag; another counter every second.
         self.written: collections.Counter[str] = collections.Counter()
         self._added: dict[str, RecordedChannel] = {}
@@ -157,7 +157,7 @@ class BagWriter:
 
     def _work(self) -> None:
         """The thread: never raises."""
-        self._due, told = time.monotonic() + FLUSH_PERIOD_S, 0
+        self._due, counted = time.monotonic() + FLUSH_PERIOD_S, 0
         try:
             while (item := self._take(self._due)) or not self._closing:
                 if item:
@@ -167,7 +167,7 @@ class BagWriter:
                     self._present.sync()
                     self._count()
                     self._check_room()
-                    if told != (told := self.written.total()):
+                    if counted != (counted := self.written.total()):
                         self._write_metadata()
                     self._due = time.monotonic() + FLUSH_PERIOD_S
             self._present.flush()
@@ -200,7 +200,7 @@ class BagWriter:
 
     def _put(self, item: _Waiting) -> None:
         self._unchecked += len(item.data)
-        if self._unchecked >= CHUNK:
+        if self._unchecked >= CHUNK_BYTES:
             self._check_room()
         if self._channels and (
                 0 < self._max_bytes <= self._present.size
@@ -218,11 +218,11 @@ class BagWriter:
         self._present.add(self._channels[channel], item.data, item.stamp, item.sequence)
 
     def _stop(self, error: Exception) -> None:
-        # Not every OSError has a number and words of the system.
-        words = ((error.strerror if isinstance(error, OSError) else None)
-                 or f'{type(error).__name__}: {error}')
+        # Not every OSError has a number and a text of the system.
+        reason = ((error.strerror if isinstance(error, OSError) else None)
+                  or f'{type(error).__name__}: {error}')
         with self._change:
-            self.stopped = self.stopped or words
+            self.stopped = self.stopped or reason
             self._queue.clear()
             self._change.notify_all()
 
