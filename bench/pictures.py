@@ -4,8 +4,8 @@
 
 Each hostile file of `test/picture_bytes.py` is decoded in a child process of its own: CPU seconds
 until it is refused, and the peak of memory (VmHWM) above what the child held before. Then the CPU
-time to decode sound pictures, 640 x 480, compared with plain `cv2.imdecode` and the same conversion
-to RGB; the two take turns. One JSON line a figure.
+time to decode sound pictures, 640 x 480, compared with plain `cv2.imdecode` and the same
+conversion to RGB; the two take turns. One JSON line a figure.
 """
 
 from __future__ import annotations

@@ -194,6 +194,6 @@ def _print(diagnosis) -> None:
 def _stamps(figures) -> str:
     if figures.unordered is None:
         return ''
-    faults = [f'{count} {what}' for count, what in ((figures.unordered, 'back'),
-                                                     (figures.repeated, 'twice')) if count]
+    kinds = (figures.unordered, 'back'), (figures.repeated, 'twice')
+    faults = [f'{count} {what}' for count, what in kinds if count]
     return ', '.join(faults) or 'in order'
