@@ -98,7 +98,7 @@ class CommandOutput:
             self._wake.notify_all()
 
     def _jump(self, values: np.ndarray, now: float, back: float) -> str:
-        """A step in the pose that no driving explains, in words; empty: there is none."""
+        """A step in the pose that no driving explains, as a reason; empty: there is none."""
         if self.odometry is None:
             return ''
         if back > 0.0:
