@@ -1,4 +1,4 @@
-"""Bags to training batches: frames a second, beside what others offer.
+"""Bags to training batches: frames a second, compared with what others offer.
 
     python bench/bags.py --rounds 5
 
@@ -30,8 +30,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from vn_msgs_py.images import fill_compressed
 from vn_msgs_py.motion import yaw_to_quaternion
-from vn_nav.bags.dataset import Wanted, decoded, load_drives, read_steps
+from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.drive import Report
+from vn_nav.bags.drive_cache import load_drives
+from vn_nav.bags.drive_decoder import decoded, read_steps
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 SIZE, BATCH = 84, 32

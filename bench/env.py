@@ -1,4 +1,4 @@
-"""Decisions per second of NavigationEnv beside the bare renderer, and its memory.
+"""Decisions per second of NavigationEnv compared with the bare renderer, and its memory.
 
 python bench/env.py
 """

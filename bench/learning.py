@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 from vn_nav.errors import UserError
-from vn_nav.report.curves import HOLD, THRESHOLDS, reached, read_runs
+from vn_nav.report.curves import HOLD_SHARE, THRESHOLDS, reached, read_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 CURVES = ROOT / 'docs' / 'curves' / 'table'
@@ -33,11 +33,11 @@ ROWS = 400  # kept of a curve
 
 def command(preset: str, seed: int, folder: Path, minutes: float) -> list[str]:
     """The training of one cell of the table."""
-    words = [sys.executable, '-m', 'vn_nav.cli', 'train', '--preset', preset,
+    command = [sys.executable, '-m', 'vn_nav.cli', 'train', '--preset', preset,
              '--house', str(HOUSE), '--rooms', str(ROOMS), '--seed', str(seed),
              '--minutes', str(minutes), '--frames', '1e9', '--max-decisions', '300',
              '--no-tensorboard', '--out', str(folder)]
-    return words + (['--resume'] if folder.exists() else [])
+    return command + (['--resume'] if folder.exists() else [])
 
 
 def is_over(folder: Path, minutes: float) -> bool:
@@ -48,7 +48,7 @@ def is_over(folder: Path, minutes: float) -> bool:
         return False
     now = run.columns['minutes'][-1]
     there = reached(run, max(THRESHOLDS))
-    return now >= 0.999 * minutes or there is not None and now >= there[1] + HOLD * minutes
+    return now >= 0.999 * minutes or there is not None and now >= there[1] + HOLD_SHARE * minutes
 
 
 def read(folder: Path) -> list[dict]:

@@ -23,7 +23,7 @@ import numpy as np
 from common import pin
 
 from vn_nav.arrival import wrap_angle
-from vn_nav.bags.mapping.loop_closure import between, straighten
+from vn_nav.bags.mapping.loop_closure import between, optimise_odometry
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.floor.floor_map import CELL
@@ -189,7 +189,7 @@ def false(closures: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def main():
-    """Drive, go astray, straighten, report."""
+    """Drive, add drift, close loops, report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--houses', type=int, nargs='+', default=[12000, 12001])
     parser.add_argument('--rooms', type=int, default=5)
@@ -218,7 +218,7 @@ def _compare(house: int, driven: Drive, factor: float, arguments: argparse.Names
         image=driven.image, pose=odometry, time=driven.time,
         episode=np.zeros(len(odometry), np.int64), depth=driven.depth if arguments.depth else None)
     begun = time.process_time()
-    made = straighten(drives, ROBOT)
+    made = optimise_odometry(drives, ROBOT)
     spent = time.process_time() - begun
     before, after = errors(odometry, driven.pose), errors(made.poses, driven.pose)
     print(f'{house:5} {driven.image.shape[-1]:4} {factor:5.1f} {len(odometry):8} | '

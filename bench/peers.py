@@ -1,6 +1,6 @@
 """Frame rates of other simulators, for the side-by-side run of bench/render.py.
 
-Runs in an environment of its own (bench/requirements.txt), is told on standard input when to
+Runs in an environment of its own (bench/requirements.txt), receives on standard input when to
 measure, and answers one JSON line each time: {"peer": frames per second, ...}.
 """
 

@@ -2,7 +2,7 @@
 
 `PlainLoop` is the plain way to write one: the goal stacked under every picture, rollouts in
 tensors, nn.LSTM stepped through time. sb3-contrib's RecurrentPPO runs in an environment of its
-own (bench/requirements.txt), as this file's main program: it is told on standard input when to
+own (bench/requirements.txt), as this file's main program: it receives on standard input when to
 """
 
 import argparse

@@ -4,8 +4,8 @@
 
 Each hostile file of `test/picture_bytes.py` is decoded in a child process of its own: CPU seconds
 until it is refused, and the peak of memory (VmHWM) above what the child held before. Then the CPU
-time to decode sound pictures, 640 x 480, beside plain `cv2.imdecode` and the same conversion to
-RGB; the two take turns. One JSON line a figure.
+time to decode sound pictures, 640 x 480, compared with plain `cv2.imdecode` and the same
+conversion to RGB; the two take turns. One JSON line a figure.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def hostile() -> None:
                               capture_output=True, check=False)
         if done.returncode:
             raise SystemExit(f'{name}: {done.stderr.decode()[-500:]}')
-        took[name] = [float(word) for word in done.stdout.split()]
+        took[name] = [float(part) for part in done.stdout.split()]
     for k, (what, unit, scale) in enumerate((('CPU time', 's', 1.0), ('memory', 'MB', 1e6))):
         most = max(took, key=lambda name, k=k: took[name][k])
         report(f'hostile pictures, {what}', [row[k] / scale for row in took.values()],
@@ -83,7 +83,7 @@ def milliseconds(decode, data: bytes) -> float:
 
 
 def ratios(rounds: int) -> None:
-    """Our decoder beside OpenCV's, a figure for each kind of file."""
+    """Our decoder compared with OpenCV's, a figure for each kind of file."""
     import picture_bytes
     picture = picture_bytes.photo(HEIGHT, WIDTH)
     files = {'JPEG, quality 95': picture_bytes.encoded(picture, '.jpg'),

@@ -15,7 +15,7 @@ none of them with the picture pairs of the simulator that `fast` otherwise learn
 
 The weights are pre-trained once, the reinforcement has several seeds. What was interrupted goes
 on, what has ended is not repeated. Curves go to docs/curves/pretraining/, those without the
-curriculum, whose own steps take most of the frames of this house, to a folder beside.
+curriculum, whose own steps take most of the frames of this house, to another folder.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ SCRATCH, IMAGES, CLONING = ARMS = ('scratch', 'images', 'cloning')
 MINUTES = 20.0  # of a reinforcement run at most
 
 
-def call(*words: str, log: Path) -> None:
+def call(*arguments: str, log: Path) -> None:
     """A command of the project or of the bench; its failure ends this program."""
-    print(*words[:4], '...', flush=True)
+    print(*arguments[:4], '...', flush=True)
     with open(log, 'a') as file:
-        done = subprocess.run([sys.executable, *words], stdout=file, stderr=subprocess.STDOUT,
+        done = subprocess.run([sys.executable, *arguments], stdout=file, stderr=subprocess.STDOUT,
                               cwd=ROOT, env=os.environ | {'OMP_NUM_THREADS': '1'})
     if done.returncode:
-        raise SystemExit(f'{" ".join(words)} ended with {done.returncode}: see {log}')
+        raise SystemExit(f'{" ".join(arguments)} ended with {done.returncode}: see {log}')
 
 
 def pretrain(runs: Path, epochs: int) -> dict[str, Path]:
@@ -55,11 +55,11 @@ def pretrain(runs: Path, epochs: int) -> dict[str, Path]:
     seen, drive, done = runs / 'seen', runs / 'joystick' / 'bag', runs / 'pretrain.json'
     took = json.loads(done.read_text()) if done.is_file() else {}
 
-    def once(name: str, out: Path, *words: str) -> None:
+    def once(name: str, out: Path, *arguments: str) -> None:
         if name not in took:
             begun = time.monotonic()
             shutil.rmtree(out, ignore_errors=True)
-            call(*words, log=runs / f'{name}.log')
+            call(*arguments, log=runs / f'{name}.log')
             took[name] = round((time.monotonic() - begun) / 60, 2)
             done.write_text(json.dumps(took, indent=2) + '\n')
 
@@ -70,9 +70,10 @@ def pretrain(runs: Path, epochs: int) -> dict[str, Path]:
          str(drive.parent), '--house', str(HOUSE), '--rooms', str(ROOMS), '--camera-height', '1.0',
          '--drift', '0', '--size', '84')
     first = {IMAGES: ([seen], '--heads', IMAGE_HEADS, '--no-cloning'), CLONING: ([seen, drive],)}
-    for arm, (bags, *words) in first.items():
+    for arm, (bags, *arguments) in first.items():
         once(arm, runs / arm, '-m', 'vn_nav.cli', 'pretrain', *map(str, bags), '--out',
-             str(runs / arm), '--epochs', str(epochs), '--cache', str(runs / 'decoded'), *words)
+             str(runs / arm), '--epochs', str(epochs), '--cache', str(runs / 'decoded'),
+             *arguments)
     print('minutes:', took, flush=True)
     return {arm: runs / arm / 'checkpoint' for arm in first}
 
@@ -83,18 +84,18 @@ def train(runs: Path, arm: str, seed: int, init: Path | None, minutes: float,
     folder = runs / f'{arm}-seed{seed}'
 
     def over() -> bool:
-        # Without a curriculum the first episodes to end are successful, and tell nothing.
+        # Without a curriculum the first episodes to end are successful, and show nothing.
         return is_over(folder, minutes) if curriculum else (folder / 'over').is_file()
     if not over():
-        words = [sys.executable, '-m', 'vn_nav.cli', 'train', '--preset', 'fast',
+        arguments = [sys.executable, '-m', 'vn_nav.cli', 'train', '--preset', 'fast',
                  '--house', str(HOUSE), '--rooms', str(ROOMS), '--seed', str(seed),
                  '--minutes', str(minutes), '--frames', '1e9', '--max-decisions', '300',
                  '--pair-minutes', '0', '--no-tensorboard', '--out', str(folder),
                  *(() if curriculum else ('--set', 'start_difficulty=1.0'))]
-        words += ['--resume'] if folder.exists() else ['--init', str(init)] if init else []
+        arguments += ['--resume'] if folder.exists() else ['--init', str(init)] if init else []
         print(f'{folder.name}, {minutes:g} minutes at most', flush=True)
         with open(runs / f'{folder.name}.log', 'a') as log:
-            process = subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT,
+            process = subprocess.Popen(arguments, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT,
                                        env=os.environ | {'OMP_NUM_THREADS': '1'})
         while process.poll() is None:
             time.sleep(5)

@@ -1,4 +1,4 @@
-"""Frames per second of the CPU renderer (RGB + depth + labels) beside other simulators.
+"""Frames per second of the CPU renderer (RGB + depth + labels) compared with other simulators.
 
 Everything is measured in one run, in turns, pinned to one core (two where it says so). The peers
 live in an environment of their own, see bench/requirements.txt; without it their rows are left

@@ -1,4 +1,4 @@
-"""Steps a second of a training over ROS topics, in lock-step, beside the in-process environment.
+"""Steps a second of a training over ROS topics, in lock-step, compared with the in-process one.
 
 The simulator runs in a process of its own behind topics (`sim_bridge_node`, time:=lock_step, the
 quick base); the same preset learns from it and, in turns, from one environment in this process.
@@ -40,11 +40,11 @@ ROBOT = load_robot(BASE).with_actions(DRIVE_ACTIONS)
 
 def start_bridge() -> subprocess.Popen:
     """The simulated robot as a process."""
-    words = [sys.executable, '-m', 'vn_sim_bridge.bridge_node', '--ros-args']
+    command = [sys.executable, '-m', 'vn_sim_bridge.bridge_node', '--ros-args']
     for name, value in {'house': HOUSE, 'rooms': ROOMS, 'robot': str(BASE),
                         'time': 'lock_step'}.items():
-        words += ['-p', f'{name}:={json.dumps(value)}']
-    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        command += ['-p', f'{name}:={json.dumps(value)}']
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
                             env=os.environ | {'OMP_NUM_THREADS': '1'})
 
 

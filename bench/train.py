@@ -1,4 +1,4 @@
-"""Decisions per second of our training, end to end, beside other recurrent PPO loops.
+"""Decisions per second of our training, end to end, compared with other recurrent PPO loops.
 
 One environment, one network (same weights, same outputs: checked first), same rollouts, epochs,
 minibatches, one thread; in turns, pinned to one core. RecurrentPPO lives in an environment of its

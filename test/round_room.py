@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from vn_nav.bags.dataset import DriveSet
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)

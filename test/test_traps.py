@@ -149,7 +149,7 @@ RESIZES = ('resize', 'interpolate', 'grid_sample', 'Upsample')
 MAY_RESIZE = {
     'vn_nav/observation.py', 'vn_sim_bridge/render/scene.py', 'vn_sim_bridge/houses/textures.py',
     'vn_sim_bridge/tools/contact_sheet.py', 'vn_sim_bridge/tools/walk.py',
-    'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor/checks.py',
+    'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor/content_checks.py',
     'vn_nav/bags/report/figures.py',  # thumbnails for a page
 }
 

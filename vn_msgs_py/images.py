@@ -160,12 +160,12 @@ def _raw_array(message: Any, allowed: tuple[str, ...]) -> np.ndarray:
 
 
 def _decompress(message: Any, smallest: int | None) -> np.ndarray:
-    words = str(message.format).lower()
-    if 'compresseddepth' in words:
+    text = str(message.format).lower()
+    if 'compresseddepth' in text:
         raise ImageError('a compressed picture is JPEG or PNG', message.format,
                          'republish depth as raw (image_transport republish)')
     # image_transport: '<encoding>; jpeg compressed <encoding of the file>'
-    name = words.partition(';')[0].strip()
+    name = text.partition(';')[0].strip()
     if name in ('16uc1', '32fc1'):
         raise ImageError('a compressed picture is grey or colour', message.format,
                          'name the topic of the camera, not of its depth')

@@ -15,7 +15,7 @@ from vn_nav.errors import UserError
 
 MAX_FILE_BYTES = 128_000_000
 MAX_JPEG_PX = 256_000_000  # of a phone's largest camera; decoded at a reduced size
-TEXT_BYTES = 256  # that are looked at to tell text from something else
+TEXT_BYTES = 256  # that are looked at: is it text?
 READ_BY_IMAGEMAGICK = {  # by the names of `ForeignFormatError`, its own names
     'HEIC': 'heic', 'AVIF': 'avif', 'GIF': 'gif', 'BMP': 'bmp', 'TIFF': 'tiff', 'WebP': 'webp',
     'JPEG XL': 'jxl', 'JPEG 2000': 'jp2'}
@@ -56,7 +56,7 @@ def read_goal_picture(path: Path) -> np.ndarray:
 
 
 def _received(data: bytes, error: ForeignFormatError) -> str:
-    """What a file that is neither JPEG nor PNG holds, in words."""
+    """What a file that is neither JPEG nor PNG holds, for people."""
     if not data:
         return 'an empty file'
     try:
@@ -74,15 +74,15 @@ def _conversion(path: Path, kind: str) -> str:
         return 'copy it again, or give another one'
     # By its kind, whatever the name says; of several pictures the first one.
     source = shlex.quote(f'{READ_BY_IMAGEMAGICK[kind]}:{path}' + '[0]' * (kind in SEVERAL))
-    target = shlex.quote(_argument(_beside(path)))
+    target = shlex.quote(_argument(_free_name(path)))
     return f'convert it: `convert {source} {target}` (ImageMagick)' + (
         ', or in Python with pillow-heif' if kind == 'HEIC' else '')
 
 
-def _beside(path: Path, word: str = '') -> Path:
-    """A JPEG beside a file whose name is free: a command overwrites what is there."""
+def _free_name(path: Path, part: str = '') -> Path:
+    """A JPEG in the folder of a file whose name is free: a command overwrites what is there."""
     for number in itertools.count():
-        more = '_'.join(filter(None, (word, str(number) if number else '')))
+        more = '_'.join(filter(None, (part, str(number) if number else '')))
         found = path.with_name(f'{path.stem}{f"_{more}" if more else ""}.jpg')
         if not os.path.lexists(found):
             return found
@@ -95,6 +95,6 @@ def _argument(path: Path) -> str:
 
 
 def _smaller(path: Path) -> str:
-    source, target = (shlex.quote(_argument(name)) for name in (path, _beside(path, 'small')))
+    source, target = (shlex.quote(_argument(name)) for name in (path, _free_name(path, 'small')))
     return (f'make it smaller: `convert {source} -auto-orient -resize 2000x2000 {target}` '
             '(ImageMagick)')

@@ -1,4 +1,4 @@
-"""Finds the files that ship beside the code: models, robots, presets, middleware profiles."""
+"""Finds the files that ship with the code: models, robots, presets, middleware profiles."""
 
 from __future__ import annotations
 

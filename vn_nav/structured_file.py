@@ -68,8 +68,8 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _refuse(word: str) -> None:
-    raise ValueError(f'{word} is no number of JSON')
+def _refuse(text: str) -> None:
+    raise ValueError(f'{text} is no number of JSON')
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -54,7 +54,7 @@ class NavigationVectorEnv(Protocol):
         """Let go of everything; a second time it does nothing."""
 
 
-# What some environments have beside, asked of them with isinstance.
+# What some environments offer in addition, asked of them with isinstance.
 
 
 @runtime_checkable
@@ -98,7 +98,7 @@ class GoalLabelsEnv(Protocol):
 
 @runtime_checkable
 class MeasuredVectorEnv(NavigationVectorEnv, Protocol):
-    """What an evaluation needs beside.
+    """What an evaluation needs in addition.
 
     `info` then also has `distance`, `heading_error`, `start_distance` (NaN: nobody knows the
     ways), `path_length`, `decisions`, `goal` and `pose`, by environment.

@@ -72,7 +72,7 @@ def jobs(arguments) -> list[str]:
 
 
 def hardware(device: str) -> str:
-    """The GPU in words, or the processor."""
+    """The name of the GPU, or of the processor."""
     from vn_nav.cli.world import machine
     return machine(device)
 
@@ -180,11 +180,11 @@ def run_training(arguments, name: str, envs: int, minutes: float, folder: Path, 
     from vn_nav.learning.trainer import train
     config = preset(name, imitation=0.0, teacher_share=0.0, pair_minutes=0.0, frames=10**9,
                     minutes=minutes, device=arguments.device, checkpoint_seconds=3600.0, **changes)
-    told = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap'}
+    computed = {'depth', 'segmentation', 'goal_segmentation', 'goal_pose', 'overlap'}
     world = {**ENVIRONMENT[name], **world, 'num_envs': envs}
     del world['envs']
     env = device_env(arguments, scenes=house_scenes(houses, rooms), size=arguments.train_size,
-                     privileged=tuple(sorted(set(config.privileged) & told)), **world)
+                     privileged=tuple(sorted(set(config.privileged) & computed)), **world)
     rows = []
     facts = FACTS | {'world_version': env.world_version, 'scenes': list(env.config.scenes),
                      'preset': name, 'notes': f'Trained on {hardware(arguments.device)}.'}

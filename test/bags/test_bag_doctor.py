@@ -29,8 +29,9 @@ from small_bags import (
 )
 
 from vn_nav import cli
-from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.doctor.checks import ERROR, WARNING, diagnose
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.robot import RobotSpec
 

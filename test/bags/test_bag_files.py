@@ -21,9 +21,10 @@ from rosbags.typesys import Stores, get_typestore
 from small_bags import STORE, STRING, drive, make, serialised, write
 
 from vn_nav import cli
-from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.doctor.recover import recover
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.storage.stream import Bag, BagError, messages, summary
 from vn_nav.robot import RobotSpec
 
@@ -186,7 +187,7 @@ def test_every_command_prints_the_remedy(tmp_path, capsys, monkeypatch, command)
 @pytest.mark.parametrize('name, words', [
     ('r_3.bag.active', 'rosbag reindex'), ('r_3.mcap.active', 'vn_nav bag recover'),
     ('r_3.mcap.part', 'vn_nav bag recover'), ('r_3.MCAP.crdownload', 'vn_nav bag recover'),
-    ('r_3.db3-wal', 'copy r_3.db3 beside it'), ('r_3.db3.part', 'finish its copy'),
+    ('r_3.db3-wal', 'copy r_3.db3 next to it'), ('r_3.db3.part', 'finish its copy'),
     ('r_3.mcap.tar.gz', 'tar -xf'), ('r_3.mcap.tgz', 'tar -xf'), ('r_3.mcap.zip', 'unzip'),
     ('r_3.mcap.7z', '7z x'), ('r_3.mcap.bak', 'rename it'), ('r_3.mcap.1', 'rename it'),
     ('r_3.mcap~', 'rename it'), ('r_3.MCAP.ZST', r'zstd -d .*/\*\.MCAP\.ZST'),

@@ -11,8 +11,9 @@ import torch
 from ros_harness import write_checkpoint
 from small_bags import FIXTURE, IMAGE, START, drive, odometry, picture, write
 
-from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import NO_ACTION, Frame
+from vn_nav.bags.dataset import Wanted
+from vn_nav.bags.drive import Frame
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.report.agreement import END, OTHER, STOP, judge
 from vn_nav.bags.report.figures import (
     MAX_BINS,
@@ -23,9 +24,11 @@ from vn_nav.bags.report.figures import (
     Timeline,
     Ways,
 )
-from vn_nav.bags.report.page import _series, show_page
+from vn_nav.bags.report.page import show_page
+from vn_nav.bags.report.page_charts import _series
 from vn_nav.bags.report.show import show
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.storage.reader import read_bag
 from vn_nav.cli import main
 from vn_nav.observation import Observation

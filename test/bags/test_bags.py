@@ -21,7 +21,7 @@ from rosbags.highlevel import AnyReader
 from vn_msgs_py.topics import TOPICS, Topic, topic
 from vn_nav.bags.storage.definitions import definition
 from vn_nav.bags.storage.losses import Losses
-from vn_nav.bags.storage.output import CHUNK, McapOutput
+from vn_nav.bags.storage.output import CHUNK_BYTES, McapOutput
 from vn_nav.bags.storage.reader import read_bag
 from vn_nav.bags.storage.stream import Bag
 from vn_nav.bags.storage.writer import BagWriter, RecordingStopped
@@ -115,7 +115,7 @@ def test_what_is_written_again_is_the_same_and_every_reader_accepts_it(tmp_path)
     assert told['starting_time']['nanoseconds_since_epoch'] == before[0][1]
     assert told['duration']['nanoseconds'] == before[-1][1] - before[0][1]
     sizes = [(tmp_path / 'bag' / name).stat().st_size for name in told['relative_file_paths']]
-    assert max(sizes[:-1]) < 60_000 + CHUNK + 20_000  # the last chunk, and the summary
+    assert max(sizes[:-1]) < 60_000 + CHUNK_BYTES + 20_000  # the last chunk, and the summary
 
 
 def test_definitions_and_quality_of_service_are_as_rosbag2_has_them(tmp_path):
@@ -173,7 +173,7 @@ def test_a_chunk_is_256_kib_or_one_message_and_all_but_the_last_are_in_the_file(
     for number, size in enumerate(sizes):
         output.add(channel, text(size, number), START + number, number + 1)
         kept = len(read_linearly(path))
-        assert sum(size + 40 for size in sizes[kept:number + 1]) <= CHUNK
+        assert sum(size + 40 for size in sizes[kept:number + 1]) <= CHUNK_BYTES
     output.flush()
     output.finish()
     assert len(read_linearly(path)) == len(sizes)
@@ -182,7 +182,7 @@ def test_a_chunk_is_256_kib_or_one_message_and_all_but_the_last_are_in_the_file(
                   if isinstance(record, Chunk)]
     assert {chunk.compression for chunk in chunks} == {'zstd'}
     assert all(chunk.uncompressed_crc for chunk in chunks)
-    assert all(chunk.uncompressed_size <= CHUNK or chunk.message_start_time
+    assert all(chunk.uncompressed_size <= CHUNK_BYTES or chunk.message_start_time
                == chunk.message_end_time for chunk in chunks)
 
 
@@ -391,7 +391,7 @@ def test_a_full_disk_and_one_below_the_limit_leave_a_whole_bag(reserve, tmp_path
     assert done.returncode == 0, done.stderr[-2000:]
     reason, free = done.stdout.splitlines()
     assert ('GB free' if reserve else 'No space left on device') in reason
-    assert int(free) > reserve - CHUNK - 100_000
+    assert int(free) > reserve - CHUNK_BYTES - 100_000
     least = (8 * 2**20 - reserve) // 20_100 - 5 * 13
     assert_whole_from_the_first(tmp_path / 'bag', least)
 
@@ -402,7 +402,7 @@ def test_a_full_disk_and_one_below_the_limit_leave_a_whole_bag(reserve, tmp_path
 def test_losses_are_counted_between_the_numbers_of_publishers():
     def lost(numbers, publishers=1):
         losses = Losses()
-        return sum(losses.hear(number, publishers) for number in numbers)
+        return sum(losses.add(number, publishers) for number in numbers)
     assert lost(range(5, 100)) == 0, "what was before the first is nobody's loss"
     assert lost([1, 2, 5, 6, 10]) == 5
     assert lost([7, 8, 9, 1, 2, 3, 5]) == 1, 'a publisher that was started again'

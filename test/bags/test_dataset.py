@@ -11,10 +11,11 @@ from paths import ROOT
 from small_bags import IMAGE, START, drive, picture, write
 
 from vn_msgs_py.images import decode_rgb
-from vn_nav.bags import dataset
-from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags import drive_cache
+from vn_nav.bags.dataset import Wanted
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.storage.reader import read_bag
 from vn_nav.errors import UserError
 from vn_nav.observation import preprocess, preprocess_map
@@ -61,7 +62,7 @@ def test_the_second_time_it_comes_from_the_cache_and_a_changed_bag_does_not(
     shutil.copytree(BAG, bag)
     first = load_drives(bag, WANTED, tmp_path / 'cache')
     decoded = []
-    monkeypatch.setattr(dataset, '_decode', lambda *_: decoded.append(1))
+    monkeypatch.setattr(drive_cache, 'decode_bag', lambda *_: decoded.append(1))
     again = load_drives(bag, WANTED, tmp_path / 'cache')
     assert not decoded and isinstance(again.image, np.memmap)
     for field in ('image', 'pose', 'time', 'action', 'episode', 'goal', 'goals', 'depth'):

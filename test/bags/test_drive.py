@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from vn_msgs_py.motion import yaw_to_quaternion
-from vn_nav.bags.drive import NO_ACTION, ActionSegmenter, Report, integrate, synchronise
+from vn_nav.bags.drive import Report, synchronise
 from vn_nav.bags.drive import TimestampedMessage as Message
+from vn_nav.bags.poses import integrate
 from vn_nav.bags.roles import TYPES, Topics, full_name, load_topics
+from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter
 from vn_nav.bags.stamped import Stamped
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -306,7 +308,7 @@ def test_what_is_held_of_depth_is_bounded():
     rows = Stamped()
     for take in range(5):
         for t in np.arange(0.0, 20.0, 0.05):
-            rows.hear(t, 30.0 * take + t, None)
+            rows.add(t, 30.0 * take + t, None)
             assert sum(len(run.stamps) for run in rows._runs) <= 3 * 41
 
 

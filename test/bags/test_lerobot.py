@@ -8,7 +8,8 @@ import pytest
 from small_bags import FIXTURE, IMAGE, START, TWIST, odometry, picture, twist, write
 
 from vn_msgs_py.images import decode_rgb
-from vn_nav.bags.export.lerobot import ACTION, CAMERA, FIRST, STATE, export
+from vn_nav.bags.export.lerobot import export
+from vn_nav.bags.export.lerobot_layout import ACTION, CAMERA, FIRST, STATE
 from vn_nav.bags.export.lerobot_stats import Colours, describe, merge
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.storage.reader import read_bag

@@ -99,7 +99,7 @@ def part(*lengths, vouched=False):
                 stretch, ['', *['odometry jumps'] * (len(lengths) - 1)], vouched)
 
 
-def straightened(own, place, **facts):
+def optimised(own, place, **facts):
     return OptimisedOdometry(np.zeros((len(own), 3)), None, np.array(own), np.array(place),
                              {'strain': 0.0, 'moved': 10.0, 'strained': 99} | facts)
 
@@ -108,24 +108,24 @@ def test_several_places_are_refused_with_the_stretches_and_how_to_take_one():
     asked = part(100, 200, 30)
     own = asked.stretch
     with pytest.raises(UserError) as error:
-        check_place(asked, straightened(own, [0, 1, 0]))
+        check_place(asked, optimised(own, [0, 1, 0]))
     assert '2 that have nothing in common' in error.value.received
     assert '1-100 (0:00 to 1:39); 101-300 (1:40 to 4:59, because odometry jumps); 301-330' in (
         error.value.received)
     assert '--pictures 101-300, or' in error.value.remedy
     assert error.value.remedy.endswith('name them all: --pictures 1-100,101-300,301-330')
-    check_place(asked, straightened(own, [0, 0, 0]))  # pictures connect them
-    check_place(part(100, 200, vouched=True), straightened(own[:300], [0, 1]))
+    check_place(asked, optimised(own, [0, 0, 0]))  # pictures connect them
+    check_place(part(100, 200, vouched=True), optimised(own[:300], [0, 1]))
     with pytest.raises(UserError, match='--no-straighten'):
         check_frame(asked)
     check_frame(part(100))
     # What odometry does not say.
     hidden = np.repeat([0, 1], [60, 40])
     with pytest.raises(UserError, match=r'61-100 \(1:00 to 1:39, because from here on no picture'):
-        check_place(part(100), straightened(hidden, [0, 1]))
+        check_place(part(100), optimised(hidden, [0, 1]))
     # Closures that bend odometry further than any drive does.
     with pytest.raises(UserError, match=r'after picture 100 \(1:39\).*up to 10.0 m'):
-        check_place(part(200), straightened(own[:200] * 0, [0], strain=50.0))
+        check_place(part(200), optimised(own[:200] * 0, [0], strain=50.0))
 
 
 def test_a_part_of_a_drive_is_chosen_by_the_numbers_of_its_pictures(tmp_path):

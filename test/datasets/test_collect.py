@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.doctor.checks import diagnose
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.bags.storage.writer import BagWriter

@@ -9,7 +9,7 @@ import torch
 from round_room import ROBOT, drive_set
 from small_bags import FIXTURE
 
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.cli import main
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.learning.bag_mix import WINDOW, BagMix, _Endless
@@ -58,7 +58,7 @@ def learner_of(bags, config=CONFIG):
     generator = torch.Generator().manual_seed(0)
     collector = Collector(env, network, generator, config.privileged)
     collector.begin(0)
-    return (Learner(network, config, generator, beside=bags.loss),
+    return (Learner(network, config, generator, auxiliary_loss=bags.loss),
             collector.collect(config.rollout_length)[0])
 
 
@@ -144,7 +144,7 @@ def test_the_weight_of_the_actions_falls_and_a_share_is_a_share():
 def test_what_bags_cannot_teach_is_left_out_and_said():
     bags = mix(depth=False, labels=False)
     assert bags.parts == ('goal_pose', 'cloning', 'arrival', 'distance')
-    assert any('depth is left out' in words for words in bags.words)
+    assert any('depth is left out' in note for note in bags.notes)
     still = drive_set(4)
     still.action[:] = NO_ACTION
     assert BagMix(Drives([still], ROBOT), CONFIG).parts == (

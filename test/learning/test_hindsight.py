@@ -8,7 +8,7 @@ from round_room import ROBOT, drive_set, look
 
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.bags.dataset import DriveSet
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.co_visibility import co_visible, lift
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import (
@@ -183,29 +183,29 @@ def test_windows_of_nothing_to_imitate_are_none():
 
 def test_a_split_sets_whole_episodes_aside():
     drives = Drives([drive_set(30)], ROBOT)
-    told = split(drives, 0.2, seed=0)
-    assert sorted(told.train + told.validation) == drives.episodes
-    assert 0.1 < len(rows_of(told.validation)) / len(drives) < 0.3
-    assert told == split(drives, 0.2, seed=0) and told != split(drives, 0.2, seed=1)
-    assert 'of 30 episodes' in told.words
+    parts = split(drives, 0.2, seed=0)
+    assert sorted(parts.train + parts.validation) == drives.episodes
+    assert 0.1 < len(rows_of(parts.validation)) / len(drives) < 0.3
+    assert parts == split(drives, 0.2, seed=0) and parts != split(drives, 0.2, seed=1)
+    assert 'of 30 episodes' in parts.summary
 
 
 @pytest.mark.parametrize('lengths', [[60], [60, 3], [30, 30]])
 def test_a_split_cuts_the_longest_episode_where_there_are_too_few(lengths):
     drives = Drives([drive_set(0, lengths=lengths)], ROBOT)
-    told = split(drives, 0.2, seed=0)
-    (first, stop), *_ = told.validation[-1:]
-    assert any(span == (first - len(rows_of([span])), first) for span in told.train)
-    assert 'the last' in told.words and abs(stop - first - 0.2 * sum(lengths)) <= 3
-    assert sorted(rows_of(told.train + told.validation)) == list(range(sum(lengths)))
+    parts = split(drives, 0.2, seed=0)
+    (first, stop), *_ = parts.validation[-1:]
+    assert any(span == (first - len(rows_of([span])), first) for span in parts.train)
+    assert 'the last' in parts.summary and abs(stop - first - 0.2 * sum(lengths)) <= 3
+    assert sorted(rows_of(parts.train + parts.validation)) == list(range(sum(lengths)))
 
 
 def test_drives_with_and_without_actions_are_both_judged():
     still = drive_set(20, seed=3)
     still.action[:] = NO_ACTION
     drives = Drives([drive_set(2, lengths=[50, 50]), still], ROBOT)
-    told = split(drives, 0.2, seed=0)
-    acting = [bool((drives.action[first:stop] >= 0).any()) for first, stop in told.validation]
+    parts = split(drives, 0.2, seed=0)
+    acting = [bool((drives.action[first:stop] >= 0).any()) for first, stop in parts.validation]
     assert set(acting) == {True, False}
 
 

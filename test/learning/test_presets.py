@@ -141,7 +141,7 @@ def parse(*words):
     ('frames=1e999', 'frames is a whole number'), ('epochs=', 'epochs is a whole number'),
     ('track_goal=1', 'track_goal is true or false'), ('clip=wide', 'clip is a number'),
     ('channels=[1,2]', 'channels is a list; each of its 3 parts is a whole number'),
-    ('channels=7', 'channels is a list'), ('extra_heads=[1]', 'each of its parts is a word'),
+    ('channels=7', 'channels is a list'), ('extra_heads=[1]', 'each of its parts is a text'),
     ('minutes=soon', 'minutes is a number')])
 def test_a_wrong_value_is_blamed_on_the_value(text, rule):
     args = parse('--set', text)

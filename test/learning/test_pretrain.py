@@ -14,7 +14,8 @@ from vn_nav.errors import UserError
 from vn_nav.learning.auxiliary import POSE_OVERLAP, image_target
 from vn_nav.learning.hindsight import Drives, partners, rows_of, split
 from vn_nav.learning.pairs import errors, measure
-from vn_nav.learning.pretraining import STATE, PretrainConfig, choose_parts, pretrain_network
+from vn_nav.learning.pretrain_config import PretrainConfig, choose_parts
+from vn_nav.learning.pretraining import STATE, pretrain_network
 from vn_nav.learning.state_file import read_state
 from vn_nav.learning.supervised import Batch, Guess, Objective, Tally
 from vn_nav.policy.checkpoint import load_checkpoint

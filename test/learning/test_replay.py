@@ -17,7 +17,8 @@ from vn_nav.learning.pixel_change import (
     label_target,
     pixel_change,
 )
-from vn_nav.learning.replay import Replay, encode_depth
+from vn_nav.learning.replay import Replay
+from vn_nav.learning.replay_rings import encode_depth
 from vn_nav.learning.returns import n_step_returns
 from vn_nav.learning.rollout import Rollout
 from vn_nav.observation import Observation

@@ -36,9 +36,9 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.presets import preset
 from vn_nav.learning.stages import Stages
-from vn_nav.learning.teach_evaluation import BEFORE, LEAST, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.learning.teach_evaluation import BEFORE, MIN_EPISODES, RIGHT, Cost, Row, plan, rows_of
 from vn_nav.learning.teach_job import TeachJob
-from vn_nav.learning.teach_network import OWN
+from vn_nav.learning.teach_network import OWN_LOGIT_SHARE
 from vn_nav.learning.teaching import teach
 from vn_nav.learning.trainer import train
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
@@ -151,7 +151,7 @@ def test_picture_pairs_come_first_and_after_the_weights_of_a_checkpoint(graph, t
     (['--goals', '1'], 'at least four goals'),
     (['--checkpoint', 'models/house', '--size', '32'], 'size is that of the checkpoint'),
     (['--checkpoint', 'nowhere'], 'a checkpoint is a folder'),
-    (['--places', '1'], '2 to 1024 spots'),
+    (['--places', '1'], '2 to 1024 place cells'),
     (['--pictures', '9-3'], 'ranges in their order'),
     (['--robot', 'nowhere.yaml'], 'a robot file exists'),
     (['--topics', 'nowhere.yaml'], 'in a YAML file'),
@@ -165,7 +165,7 @@ def test_bad_options_are_one_line_and_code_2(words, says, tmp_path, capsys):
 
 
 def test_a_drive_that_leads_nowhere_is_one_line_and_code_2(driven, tmp_path, capsys):
-    poses, pictures = (part[:40] for part in driven)  # only turns, on the first spot
+    poses, pictures = (part[:40] for part in driven)  # only turns, at the first place
     bag = write_bag(tmp_path / 'bag', poses, pictures)
     code = main(['teach', str(bag), '--out', str(tmp_path / 'out'), '--size', '36'])
     said = capsys.readouterr().err
@@ -281,7 +281,8 @@ def test_rows_and_episodes_are_as_many_as_there_is_time_for():
     rows = rows_of(['seen_goals', 'unseen_goals'], network, before)
     assert rows[0] == Row('seen_goals', 'arrival', RIGHT) and len(rows) == 20
     assert not any(row.name == BEFORE for row in rows_of(['seen_goals'], network, None))
-    costs = [Cost(LEAST, 0.01, 0.01), Cost(50, 0.055, 0.01)]  # a thousandth of a second a robot
+    # A thousandth of a second a robot.
+    costs = [Cost(MIN_EPISODES, 0.01, 0.01), Cost(50, 0.055, 0.01)]
 
     def needed(some, envs):
         return sum(300 * (0.01 + (row.name not in (SHORTEST, 'random actions'))
@@ -291,10 +292,10 @@ def test_rows_and_episodes_are_as_many_as_there_is_time_for():
     assert math.isclose(whole.seconds, needed(rows, 50))
     some = plan(rows, costs, 50, needed(rows, 20) + 0.01, 300)
     assert some.episodes == 20 and some.rows == rows
-    few = plan(rows, costs, 50, needed(rows[:7], LEAST) + 0.01, 300)
-    assert few.episodes == LEAST and few.rows == rows[:7] and few.missing == rows[7:]
+    few = plan(rows, costs, 50, needed(rows[:7], MIN_EPISODES) + 0.01, 300)
+    assert few.episodes == MIN_EPISODES and few.rows == rows[:7] and few.missing == rows[7:]
     none = plan(rows, costs, 50, -1.0, 300)
-    assert none.rows == rows[:1] and none.episodes == LEAST
+    assert none.rows == rows[:1] and none.episodes == MIN_EPISODES
     assert plan(rows, costs, 3, -1.0, 300).episodes == 3
     many = plan(rows, costs, 2 * ENVIRONMENTS, math.inf, 300)  # two rounds
     assert math.isclose(many.seconds, 2 * whole.seconds)
@@ -388,7 +389,8 @@ def test_a_policy_that_is_given_learns_the_place_by_heart(driven, tmp_path, caps
     before, after = given.network.state_dict(), taught.network.state_dict()
     for name, tensor in before.items():
         mine = after[name][:, :tensor.shape[1]] if name == 'memory.input_weight' else after[name]
-        assert torch.allclose(mine, tensor * (OWN if name.startswith('actor') else 1)), name
+        share = OWN_LOGIT_SHARE if name.startswith('actor') else 1
+        assert torch.allclose(mine, tensor * share), name
     # On a loaded machine the minutes may be over before that row: then it says so.
     page = (out / 'evaluation.html').read_text()
     assert 'before teaching' in page or 'evaluation are left out' in ' '.join(said.split())

@@ -22,9 +22,10 @@ from rosbags.typesys import Stores, get_typestore
 from small_bags import FIXTURE, IMAGE, ODOMETRY, START, drive, make, odometry, write
 
 from vn_msgs_py.images import decode_rgb
-from vn_nav.bags.dataset import Wanted, load_drives
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.dataset import Wanted
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics, load_topics
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.shadow.compare import (
     Answer,
     Shadow,

@@ -24,7 +24,7 @@ from ros_harness import child, wait_until
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Float32, String
 
-from vn_nav.bags.storage.output import CHUNK
+from vn_nav.bags.storage.output import CHUNK_BYTES
 from vn_nav.bags.storage.reader import read_bag
 from vn_nav.nodes.qos import qos
 
@@ -129,7 +129,7 @@ def test_a_killed_recorder_loses_one_chunk_at_most(talker, tmp_path):
             # says nothing: it hears when it has written.
             heard, end, sent = None, time.monotonic() + 30.0, []
             while time.monotonic() < end:
-                if heard is None and file.exists() and file.stat().st_size > CHUNK:
+                if heard is None and file.exists() and file.stat().st_size > CHUNK_BYTES:
                     heard = time.monotonic()
                     end = heard + 1.0 + 0.37 * trial
                 publisher.publish(String(data=f'{number:06}' + noise(size, number)))
@@ -151,7 +151,7 @@ def test_a_killed_recorder_loses_one_chunk_at_most(talker, tmp_path):
         assert got == list(range(got[0], got[-1] + 1)), 'without a gap'
         # What was on its way is not the recorder's to lose; half a second on a busy machine.
         due = [k for when, k in sent if when < killed - 0.5]
-        assert due[-1] - got[-1] <= CHUNK // size
+        assert due[-1] - got[-1] <= CHUNK_BYTES // size
         told = yaml.safe_load((bag / 'metadata.yaml').read_text())
         assert told['rosbag2_bagfile_information']['relative_file_paths'] == [file.name]
 

@@ -23,9 +23,10 @@ from std_msgs.msg import Bool, UInt8
 
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import fill_odometry, twist_to_array
-from vn_nav.bags.dataset import Wanted, load_drives
+from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.doctor.checks import diagnose
-from vn_nav.bags.drive import integrate
+from vn_nav.bags.drive_cache import load_drives
+from vn_nav.bags.poses import integrate
 from vn_nav.cli import main
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.learning.over_ros import config_over_ros

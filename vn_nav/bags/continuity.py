@@ -70,7 +70,7 @@ def divide(stamps: np.ndarray, breaks: list[Break], odometry: bool = True) -> St
     Args:
         stamps: [N] s, of the pictures in the order of recording.
         breaks: of the odometry.
-        odometry: whether there is any; commands alone do not tell what happened in a silence.
+        odometry: whether there is any; commands alone do not show what happened in a silence.
     """
     ends = np.cumsum([0, *(b.back for b in breaks)])[1:]  # run of the clock that each break is in
     run = np.append(0, np.cumsum(np.diff(stamps) <= -PAIRING_TIMEOUT_S))

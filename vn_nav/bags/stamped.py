@@ -67,7 +67,7 @@ class Stamped:
     def __init__(self):
         self._runs: list[_Run] = []  # the one that went on last is the last
 
-    def hear(self, stamp: float, time: float, value: Any) -> None:
+    def add(self, stamp: float, time: float, value: Any) -> None:
         """Take a message in the order of recording; late and repeated ones are left out."""
         self._runs = [run for run in self._runs[:-1] if abs(
             time - run.entries[-1].time) <= RUN_EXPIRY_S] + self._runs[-1:]
@@ -93,7 +93,7 @@ class Stamped:
 
         Args:
             stamp: of a picture [s].
-            time: when it was recorded [s], which tells apart two takes with the same stamps.
+            time: when it was recorded [s], which distinguishes two takes with the same stamps.
         """
         found = self._near(stamp, time)
         return None if found is None else found[1]

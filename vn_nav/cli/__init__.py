@@ -1,6 +1,6 @@
 """The command line: the one place where simulator and stack meet, and where options are read.
 
-Light to import: the nodes' executables hear signals before the seconds of imports begin.
+Light to import: the nodes' executables handle signals before the seconds of imports begin.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def run_doctor(args) -> int:
 
 
 def run_recover(args) -> int:
-    """`vn_nav bag recover`: 0, with what was lost told; if strict, 2 where something was."""
+    """`vn_nav bag recover`: 0, with a list of what was lost; if strict, 2 where something was."""
     from vn_nav.bags.doctor.recover import recover
     recovered = recover(args.bag, args.out)
     print('\n'.join(recovered.lines()))
@@ -194,6 +194,6 @@ def _print(diagnosis) -> None:
 def _stamps(figures) -> str:
     if figures.unordered is None:
         return ''
-    faults = [f'{count} {words}' for count, words in ((figures.unordered, 'back'),
-                                                      (figures.repeated, 'twice')) if count]
+    kinds = (figures.unordered, 'back'), (figures.repeated, 'twice')
+    faults = [f'{count} {what}' for count, what in kinds if count]
     return ', '.join(faults) or 'in order'

@@ -61,7 +61,7 @@ def run(bag: Path, checkpoint: Path, out: Path, *, other: Path | None, robot: Pa
     latencies = []
     for folder, policy in zip(outs, folders, strict=True):
         driven = _shadow().drive(plan, policy, folder, robot=robot, decoding=decoding,
-                                 say=lambda words: print(words, flush=True))
+                                 say=lambda line: print(line, flush=True))
         left_out = (f'; {plan.unreadable} pictures could not be decoded' if plan.unreadable
                     else '')
         print(f'{folder}: {_told(folder, driven)}{left_out}', flush=True)
@@ -105,9 +105,9 @@ def _words(plan: Plan) -> str:
     episodes = len({decision.episode for decision in plan.decisions})
     known = [f'{goals.shown} of the bag', f'{goals.hindsight} last pictures of episodes',
              f'{episodes - goals.shown - goals.hindsight} by --goal']
-    told = ', '.join(words for words in known if not words.startswith('0 '))
+    shown = ', '.join(part for part in known if not part.startswith('0 '))
     return (f'{report.pictures} pictures, {episodes} episodes, {len(plan.decisions)} decisions; '
-            f'{report.misfits} motions fit no action; goals: {told}; commands at '
+            f'{report.misfits} motions fit no action; goals: {shown}; commands at '
             f'{plan.rate:.3g} Hz')
 
 

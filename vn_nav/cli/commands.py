@@ -39,8 +39,8 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         'drives to where the picture was taken.')
     parser.add_argument('--version', action='version', version=f'vn_nav {__version__}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    for name, words in COMMANDS.items():
-        own = commands.add_parser(name, help=words)
+    for name, about in COMMANDS.items():
+        own = commands.add_parser(name, help=about)
         if command in (None, name):
             module = importlib.import_module(f'vn_nav.cli.{name}')
             if hasattr(module, 'run'):
@@ -51,10 +51,10 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point: 2 and one line on standard error for bad input."""
-    words = sys.argv[1:] if argv is None else argv
-    # The first word that is no option is the command: no option before it takes a value.
-    command = next((word for word in words if not word.startswith('-')), '')
-    args = build_parser(command).parse_args(words)
+    arguments = sys.argv[1:] if argv is None else argv
+    # The first argument that is no option is the command: no option before it takes a value.
+    command = next((part for part in arguments if not part.startswith('-')), '')
+    args = build_parser(command).parse_args(arguments)
     try:
         return args.run(args)
     except UserError as error:

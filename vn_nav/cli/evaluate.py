@@ -34,7 +34,7 @@ from vn_nav.scenes import BAG, HOUSE, house_scene, one_simulator, parse_scene, r
 
 # Options without meaning in a bag.
 OF_SCENES = ('scene', 'house', 'houses', 'rooms', 'randomisation')
-SPLIT_SCENES = 20  # of a split that the checkpoint does not know, unless told otherwise
+SPLIT_SCENES = 20  # of a split that the checkpoint does not know, by default
 UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 

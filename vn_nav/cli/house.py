@@ -9,11 +9,11 @@ from pathlib import Path
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The actions of `vn_nav house`."""
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
-    for name, words, run, out in (
+    for name, about, run, out in (
             ('show', 'write a contact sheet: views and a map', _show, 'png'),
             ('walk', 'drive with the keyboard', _walk, None),
             ('export', 'write a mesh that other programs open', _export, 'glb')):
-        action = actions.add_parser(name, help=words)
+        action = actions.add_parser(name, help=about)
         action.add_argument('--seed', type=int, default=7)
         action.add_argument('--rooms', type=int, default=5)
         if name != 'export':

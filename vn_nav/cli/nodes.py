@@ -1,4 +1,4 @@
-"""Entry points of the nodes. They hear signals before the seconds of imports begin."""
+"""Entry points of the nodes. They handle signals before the seconds of imports begin."""
 
 from __future__ import annotations
 

@@ -16,27 +16,28 @@ from vn_nav.errors import UserError
 
 def add_place_options(parser: argparse.ArgumentParser) -> None:
     """How pictures become a place."""
-    from vn_nav.bags.mapping.recorded_place import GOALS
+    from vn_nav.bags.mapping.recorded_place import MAX_GOALS
     parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
     parser.add_argument('--margin', type=float, metavar='M',
-                        help='beside the driven path that counts as free [m]; default 0.3')
+                        help='around the driven path that counts as free [m]; default 0.3')
     parser.add_argument('--straighten', action=argparse.BooleanOptionalAction, default=True,
-                        help='correct odometry by the places that the drive shows twice '
-                        '(docs/bags.md)')
+                        help='correct odometry by loop closure: by the places that the drive '
+                        'shows twice (docs/bags.md)')
     parser.add_argument('--pictures', metavar='A-B[,C-D]', help='numbers of those to learn from; '
                         'several ranges: you vouch for their odometry being in one frame')
-    parser.add_argument('--goals', type=int, default=GOALS, help='pictures to drive to, at most')
+    parser.add_argument('--goals', type=int, default=MAX_GOALS,
+                        help='pictures to drive to, at most')
     parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags; '
                         'default: `decoded` in the folder of a run, or none')
 
 
 def given_place_options(args: argparse.Namespace) -> list[str]:
     """Names of those that differ from their default."""
-    from vn_nav.bags.mapping.recorded_place import GOALS
+    from vn_nav.bags.mapping.recorded_place import MAX_GOALS
     given = {'--topics': args.topics, '--margin': args.margin, '--cache': args.cache,
              '--pictures': args.pictures,
              '--no-straighten': None if args.straighten else True,
-             '--goals': None if args.goals == GOALS else args.goals}
+             '--goals': None if args.goals == MAX_GOALS else args.goals}
     return [name for name, value in given.items() if value is not None]
 
 
@@ -49,7 +50,7 @@ def place_options(args: argparse.Namespace):
     from vn_nav.bags.mapping.recorded_place import PlaceOptions
     from vn_nav.bags.roles import Topics, load_topics
     return PlaceOptions(topics=load_topics(args.topics) if args.topics else Topics(),
-                        margin=args.margin, straighten=args.straighten,
+                        margin=args.margin, loop_closure=args.straighten,
                         pictures=args.pictures or '', goals=args.goals)
 
 
@@ -72,7 +73,7 @@ def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
         except (ValueError, SyntaxError):
             changes[name] = value
         if isinstance(known[name], str):
-            changes[name] = value  # a word, whatever it looks like
+            changes[name] = value  # a text, whatever it looks like
     return changes
 
 
@@ -84,6 +85,6 @@ def check_folders(*files: Path | None) -> None:
                             'make the folder, or choose another place')
 
 
-def command_words() -> str:
+def command_line() -> str:
     """This command as somebody would repeat it."""
-    return 'vn_nav ' + shlex.join(word for word in sys.argv[1:] if word != '--resume')
+    return 'vn_nav ' + shlex.join(part for part in sys.argv[1:] if part != '--resume')

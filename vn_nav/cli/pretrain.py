@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 
 from vn_nav.bags.roles import Topics, load_topics
-from vn_nav.cli.options import command_words, parse_changes
+from vn_nav.cli.options import command_line, parse_changes
 from vn_nav.learning.presets import PRESETS
+from vn_nav.learning.pretrain_config import PretrainConfig
 from vn_nav.learning.pretrain_job import PretrainJob, pretrain
-from vn_nav.learning.pretraining import PretrainConfig
 from vn_nav.learning.supervised import PARTS
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
 
@@ -68,5 +68,5 @@ def run(args: argparse.Namespace) -> int:
         cloning=args.cloning, robot=load_robot(args.robot) if args.robot else RobotSpec(),
         topics=load_topics(args.topics) if args.topics else Topics(), cache=args.cache,
         threads=args.threads, device=args.device, resume=args.resume, numbers=numbers,
-        command=command_words())))
+        command=command_line())))
     return 0

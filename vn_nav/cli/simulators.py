@@ -17,8 +17,8 @@ def run(args: argparse.Namespace) -> int:
     """`vn_nav simulators`: what there is, what each can do, what is missing here."""
     from vn_sim_bridge.simulators import missing, simulator_class, table
 
-    def say(label: str, words: str) -> None:
-        print(textwrap.fill(words, 79, initial_indent=f'  {label:<8}', subsequent_indent=' ' * 10,
+    def say(label: str, text: str) -> None:
+        print(textwrap.fill(text, 79, initial_indent=f'  {label:<8}', subsequent_indent=' ' * 10,
                             break_long_words=False, break_on_hyphens=False))
 
     for name, entry in table().items():

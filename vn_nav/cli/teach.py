@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vn_nav.cli.options import add_place_options, command_words, parse_changes, place_options
+from vn_nav.cli.options import add_place_options, command_line, parse_changes, place_options
 from vn_nav.learning.presets import ENVIRONMENT
 from vn_nav.learning.teach_job import PLACES, PRESET, TeachJob
 from vn_nav.learning.teaching import teach
@@ -24,8 +24,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--robot', type=Path, metavar='YAML',
                         help='that drove, with its camera; default: the standard robot')
     add_place_options(parser)
-    parser.add_argument('--places', type=int, default=PLACES, metavar='K', help='spots of the '
-                        'place that the policy knows by heart; 0: none')
+    parser.add_argument('--places', type=int, default=PLACES, metavar='K', help='place cells '
+                        'by which the policy recognises the place; 0: none')
     parser.add_argument('--episodes', type=int, default=50, help='of each row of the '
                         'evaluation, at most')
     parser.add_argument('--size', type=int, help='without a checkpoint: side of the pictures '
@@ -52,6 +52,6 @@ def run(args: argparse.Namespace) -> int:
         robot=load_robot(args.robot) if args.robot else RobotSpec(), options=place_options(args),
         places=args.places, episodes=args.episodes, size=args.size, envs=args.envs,
         changes=parse_changes(args.set), cache=args.cache, resume=args.resume, seed=args.seed,
-        threads=args.threads, command=command_words())
+        threads=args.threads, command=command_line())
     print(teach(job, place))
     return 0

@@ -8,7 +8,7 @@ import datetime
 import math
 from pathlib import Path
 
-from vn_nav.cli.options import command_words, parse_changes
+from vn_nav.cli.options import command_line, parse_changes
 from vn_nav.cli.scenes import training_scenes
 from vn_nav.cli.world import add_world, check_backend, machine, make_env
 from vn_nav.errors import UserError
@@ -19,7 +19,7 @@ from vn_nav.learning.trainer import train
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_nav.scenes import ROOMS
 
-# Options that are numbers of `TrainConfig`, with their words.
+# Options that are numbers of `TrainConfig`, with their help.
 NUMBERS = {
     'frames': (float, 'agent decisions; schedules end here'),
     'minutes': (float, 'stop after this wall-clock time; schedules end then'),
@@ -59,7 +59,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_train_options(parser: argparse.ArgumentParser) -> None:
-    """Options of `vn_nav train`, beside those of the world."""
+    """Options of `vn_nav train`, without those of the world."""
     parser.add_argument('--preset', choices=tuple(PRESETS), default='fast',
                         help='where every number comes from that is not given')
     parser.add_argument('--out', type=Path, required=True, help='folder of the run')
@@ -89,8 +89,8 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--actions', default=','.join(DRIVE_ACTIONS),
                         help="names from the robot's table, with commas between")
     parser.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
-    for name, (kind, words) in (NUMBERS | WORLD).items():
-        parser.add_argument('--' + name.replace('_', '-'), type=kind, help=words)
+    for name, (kind, about) in (NUMBERS | WORLD).items():
+        parser.add_argument('--' + name.replace('_', '-'), type=kind, help=about)
     parser.add_argument('--channels', type=int, nargs=3, help='of the fused convolutions')
     parser.add_argument('--curriculum', choices=('success', 'frames'),
                         help='what raises the difficulty')
@@ -179,10 +179,10 @@ def run(args: argparse.Namespace) -> int:
 def _info(args: argparse.Namespace, config, env, bags) -> dict:
     """What every checkpoint of a training says."""
     taught = '' if bags is None else (
-        f', beside {len(bags.drives):,} steps of {len(args.bags)} bag{"s" * (len(args.bags) > 1)}')
+        f', and {len(bags.drives):,} steps of {len(args.bags)} bag{"s" * (len(args.bags) > 1)}')
     return {
         'preset': args.preset,
-        'command': command_words(),
+        'command': command_line(),
         'camera_fov_deg': math.degrees(env.robot.camera_fov),
         'camera_height': env.robot.camera_height,
         'notes': f'Trained on {machine(config.device)}, {config.threads} thread(s), '
@@ -202,7 +202,7 @@ def _bag_mix(args: argparse.Namespace, config, robot):
                           args.cache or args.out / 'decoded', print_line)
     bags = BagMix(drives, config)
     parts = ', '.join(bags.parts).replace('_', ' ')
-    for line in (*bags.words, f'bags teach {parts}'):
+    for line in (*bags.notes, f'bags teach {parts}'):
         print(line, flush=True)
     return bags
 
@@ -228,8 +228,8 @@ def _over_ros(args: argparse.Namespace) -> int:
                 namespaces=args.namespaces or ('',), lock_step=args.lock_step,
                 max_decisions=world['max_decisions'], collision_reward=world['collision_reward'],
                 record=args.record, ros_arguments=args.ros_args or ()) as env:
-        config, words = config_over_ros(config, world, env.offers, args.lock_step)
-        for line in words:
+        config, notes = config_over_ros(config, world, env.offers, args.lock_step)
+        for line in notes:
             print(line, flush=True)
         env.listen(config.privileged)
         info = _info(args, config, env, bags) | {

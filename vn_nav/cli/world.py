@@ -104,7 +104,7 @@ def _check_gpu(device: str) -> None:
 
 
 def machine(device: str = 'cpu') -> str:
-    """The processor in words, or the GPU."""
+    """The name of the processor, or of the GPU."""
     if device != 'cpu':
         import torch
         return torch.cuda.get_device_name(device)

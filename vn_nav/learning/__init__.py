@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vn_nav.learning.presets import TrainConfig, preset
+    from vn_nav.learning.pretrain_config import PretrainConfig
     from vn_nav.learning.pretrain_job import PretrainJob, pretrain
-    from vn_nav.learning.pretraining import PretrainConfig
     from vn_nav.learning.teach_job import TeachJob
     from vn_nav.learning.teaching import teach
     from vn_nav.learning.trainer import train

@@ -1,4 +1,4 @@
-"""Recorded drives beside rollouts: what every step of the optimiser learns from bags as well."""
+"""Recorded drives as an auxiliary loss: every step of the optimiser learns from bags as well."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives, draw_windows, partners, rows_of
 from vn_nav.learning.presets import TrainConfig
-from vn_nav.learning.pretraining import PretrainConfig, choose_parts
+from vn_nav.learning.pretrain_config import PretrainConfig, choose_parts
 from vn_nav.learning.rollout import Rollout
 from vn_nav.learning.supervised import NEEDS, Batch, Objective, Tally
 from vn_nav.policy.network import Policy
@@ -34,7 +34,7 @@ class BagMix:
 
     Attributes:
         parts: of `supervised.PARTS` that are learned.
-        words: what is not, and why.
+        notes: lines about what is not, and why.
 
     Raises:
         UserError: a frozen encoder, or nothing to learn.
@@ -50,10 +50,10 @@ class BagMix:
         asked = [name for name in (*NEEDS, 'goal_pose', 'arrival', 'distance')
                  if self._weight(name) > 0]
         # Arrival and distance are learned along the actions, whether or not these are imitated.
-        parts, self.words = choose_parts(drives, asked, (), None)
+        parts, self.notes = choose_parts(drives, asked, (), None)
         self.parts = tuple(part for part in parts if self._weight(part) > 0)
         if not self.parts:
-            raise UserError('bags beside rollouts teach something', 'weights of 0',
+            raise UserError('bags teach something', 'weights of 0',
                             'give one of the numbers bag_... a weight, or leave out --bags')
         self._tally = Tally()
 
@@ -138,7 +138,7 @@ class _Endless:
 
     Args:
         epoch: makes the rows of an epoch [K,...], K at least 1, with a generator of its own.
-        seed: of the generators, beside the number of the epoch.
+        seed: of the generators, together with the number of the epoch.
     """
 
     def __init__(self, epoch: Callable[[np.random.Generator], np.ndarray], seed: tuple[int, ...]):

@@ -30,9 +30,9 @@ from torch import Tensor, nn
 from vn_nav.errors import UserError
 from vn_nav.learning import returns
 
-WAIT = 30.0  # min that a process waits for another one
-MEET = 5.0  # min that it waits for all of them at the start
-LOOK = 0.05  # s between looks for the others
+WAIT_MIN = 30.0  # min that a process waits for another one
+MEET_MIN = 5.0  # min that it waits for all of them at the start
+POLL_PERIOD_S = 0.05  # s between looks for the others
 
 
 def _meeting_point() -> dict[str, Any]:
@@ -40,7 +40,7 @@ def _meeting_point() -> dict[str, Any]:
 
     Newer torchruns (2.13 does) keep one store for all their attempts: what the processes before a
     restart wrote is still in it, and whoever reads the address of a dead one waits for ever.
-    So each process leaves a fresh token and tells whose tokens it sees; when all see the same
+    So each process leaves a fresh token and lists the tokens that it sees; when all see the same
     ones, all are of this attempt, because nothing old can name a fresh token. Under the name of
     that view the store is empty.
     """
@@ -48,10 +48,10 @@ def _meeting_point() -> dict[str, Any]:
         return {}  # torchrun has made a new store for this attempt
     rank, count = int(os.environ['RANK']), int(os.environ['WORLD_SIZE'])
     store = dist.TCPStore(os.environ['MASTER_ADDR'], int(os.environ['MASTER_PORT']), count,
-                          is_master=False, timeout=datetime.timedelta(minutes=MEET))
+                          is_master=False, timeout=datetime.timedelta(minutes=MEET_MIN))
     token = uuid.uuid4().hex
     store.set(f'vn_nav/token/{rank}', token)
-    until = time.monotonic() + 60 * MEET
+    until = time.monotonic() + 60 * MEET_MIN
 
     def left(kind: str) -> list[bytes]:
         names = [f'vn_nav/{kind}/{other}' for other in range(count)]
@@ -63,10 +63,10 @@ def _meeting_point() -> dict[str, Any]:
         if all(tokens) and set(left('view')) == {view.encode()}:
             return {'store': dist.PrefixStore(view, store), 'rank': rank, 'world_size': count}
         if time.monotonic() > until:
-            raise UserError(f'all {count} processes start within {MEET:g} minutes',
+            raise UserError(f'all {count} processes start within {MEET_MIN:g} minutes',
                             f'{sum(map(bool, tokens))} of them', 'see what torchrun says of the '
                             'others, on every machine')
-        time.sleep(LOOK)
+        time.sleep(POLL_PERIOD_S)
 
 
 class Objective(nn.Module):
@@ -101,7 +101,7 @@ class Processes:
         """Those that torchrun started, or that a process group already has; else this one.
 
         Args:
-            patience: minutes that the others may have to wait for one process, beyond `WAIT`.
+            patience: minutes that the others may have to wait for one process, beyond `WAIT_MIN`.
         """
         launched = dist.is_torchelastic_launched()
         if not launched and not dist.is_initialized():
@@ -113,7 +113,7 @@ class Processes:
                 torch.cuda.set_device(int(os.environ['LOCAL_RANK']) % torch.cuda.device_count())
             dist.init_process_group(
                 'cpu:gloo,cuda:nccl' if gpu else 'gloo', **_meeting_point(),
-                timeout=datetime.timedelta(minutes=WAIT + patience))
+                timeout=datetime.timedelta(minutes=WAIT_MIN + patience))
         restarts = os.environ['TORCHELASTIC_RESTART_COUNT'] if launched else 0
         processes = cls(dist.get_rank(), dist.get_world_size(), int(restarts) > 0)
         processes.owner = owner
@@ -176,8 +176,8 @@ class Processes:
         dist.all_gather_object(values, value)
         return values
 
-    def told(self, find: Callable[[], Any]) -> Any:
-        """What the leading process finds. Its error ends it, and so the others' waiting."""
+    def from_leader(self, find: Callable[[], Any]) -> Any:
+        """A value that the leading process finds, for all. Its error ends the others' waiting."""
         values = [find() if self.leads else None]
         if self.count > 1:
             dist.broadcast_object_list(values, 0)

@@ -14,7 +14,7 @@ import numpy as np
 
 from vn_nav.arrival import arrived, heading_error
 from vn_nav.bags.dataset import MAX_DEPTH
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.co_visibility import co_visible, co_visible_by_poses, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Half of the partners lie within so many steps: the others show the same place too seldom.
 NEIGHBOURS = 8
-LEAST = 2  # steps of a part of a drive to learn from, or to judge by
+MIN_PART_STEPS = 2  # steps of a part of a drive to learn from, or to judge by
 
 Span = tuple[int, int]  # first row of an episode, and the row after its last
 
@@ -54,7 +54,7 @@ class Split(NamedTuple):
 
     train: list[Span]
     validation: list[Span]
-    words: str  # how they were told apart
+    summary: str  # how the episodes were split
 
 
 class Drives:
@@ -86,7 +86,7 @@ class Drives:
         self.episodes: list[Span] = [
             (int(first + steps.start), int(first + steps.stop))
             for first, part in zip(self._first[:-1], sets, strict=True)
-            for steps in part.episodes() if steps.stop - steps.start >= LEAST]
+            for steps in part.episodes() if steps.stop - steps.start >= MIN_PART_STEPS]
         if not self.episodes:
             raise UserError('bags to learn from hold an episode with two steps, where the robot '
                             'has moved in between', f'{len(self.action)} steps, each alone',
@@ -159,7 +159,7 @@ class Drives:
 def split(drives: Drives, share: float, seed: int) -> Split:
     """Set a share of the steps aside, in whole episodes if those there are allow it.
 
-    Where they do not (a single episode, or a long one beside short ones) the longest episode is
+    Where they do not (a single episode, or a long one among short ones) the longest episode is
     cut in time, and its end is for validation. Episodes with and without actions are split apart:
     both are judged.
 
@@ -172,7 +172,7 @@ def split(drives: Drives, share: float, seed: int) -> Split:
                      if acts == kind], share, seed) for kind in (True, False) if kind in acting]
     return Split([span for part in parts for span in part.train],
                  [span for part in parts for span in part.validation],
-                 '; '.join(part.words for part in parts))
+                 '; '.join(part.summary for part in parts))
 
 
 def _split(episodes: list[Span], share: float, seed: int) -> Split:
@@ -191,10 +191,10 @@ def _split(episodes: list[Span], share: float, seed: int) -> Split:
         return Split(train, validation, f'{len(validation)} of {len(episodes)} episodes '
                      f'({taken:,} steps) are for validation')
     first, stop = max(train, key=lambda span: span[1] - span[0])
-    if stop - first < 2 * LEAST:
+    if stop - first < 2 * MIN_PART_STEPS:
         raise UserError('a validation needs steps of its own',
                         f'{sum(lengths)} steps in {len(episodes)} episodes', 'drive more')
-    cut = stop - min(max(round(wanted - taken), LEAST), stop - first - LEAST)
+    cut = stop - min(max(round(wanted - taken), MIN_PART_STEPS), stop - first - MIN_PART_STEPS)
     train[train.index((first, stop))] = (first, cut)
     validation.append((cut, stop))
     few = 'there is one episode' if len(episodes) == 1 else (
@@ -249,7 +249,7 @@ def fill_windows(drives: Drives, windows: np.ndarray, length: int) -> Windows:
     """The steps of windows [W,3] of `draw_windows`.
 
     The memory is empty at a window's first step, as it is where a robot is shown a new goal; and
-    after a motion that was none of the robot's actions, because it cannot have been told of it.
+    after a motion that was none of the robot's actions, because it has no such action as input.
     """
     begin, stop, goal = windows.T
     time = np.arange(length)[:, None]

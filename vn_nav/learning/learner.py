@@ -43,14 +43,14 @@ class Learner:
             gradients in another way than `processes` does, or to look at them.
         processes: those that train together; each updates with its own rollout at a time, and
             the step is that of one process with all their batches.
-        beside: called with every minibatch; gives another loss of the same step, weighted.
+        auxiliary_loss: called with every minibatch; gives a weighted loss that is added.
     """
 
     def __init__(self, network: Policy, config: LearnerConfig, generator: torch.Generator, *,
                  replay: Replay | None = None,
                  average_gradients: Callable[[list[nn.Parameter]], None] | None = None,
                  processes: Processes | None = None,
-                 beside: Callable[[Rollout], Tensor] | None = None):
+                 auxiliary_loss: Callable[[Rollout], Tensor] | None = None):
         missing = [name for name in config.heads if name not in network.heads]
         if missing:
             raise UserError('the network has a head for every auxiliary task', missing,
@@ -59,7 +59,8 @@ class Learner:
             raise UserError('replayed tasks need a replay memory', config.from_replay,
                             'pass one, or set their weights to 0')
         self.network, self.config, self.generator = network, config, generator
-        self.replay, self.average_gradients, self.beside = replay, average_gradients, beside
+        self.replay, self.average_gradients = replay, average_gradients
+        self.auxiliary_loss = auxiliary_loss
         self.processes = processes or Processes()
         # Look at each step's loss before the step is made. On a GPU the host would wait for every
         # step: there it looks once an update.
@@ -181,9 +182,9 @@ class Learner:
         extra |= self._replayed_image_losses()
         for name in config.tasks:
             loss = loss + self._weights[name] * extra[name]
-        if self.beside is not None:
-            extra['beside'] = self.beside(batch)
-            loss = loss + extra['beside']
+        if self.auxiliary_loss is not None:
+            extra['auxiliary'] = self.auxiliary_loss(batch)
+            loss = loss + extra['auxiliary']
         with torch.no_grad():
             kl = masked_mean(ratio - 1 - log_ratio, valid)  # never negative
             share = (masked_mean(((ratio - 1).abs() > config.clip).float(), valid)

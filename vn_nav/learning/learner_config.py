@@ -11,11 +11,11 @@ from vn_nav.policy.network_config import IMAGE_HEADS
 REPLAY_TASKS = ('pixel_control', 'value_replay', 'reward_prediction')
 TASKS = (*REPLAY_TASKS, *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance', 'imitation')
 HEADLESS = ('value_replay', 'imitation')  # they learn through critic and actor
-# What the environment has to tell beside the observation, by task.
+# Privileged outputs of the environment that a task needs.
 PRIVILEGED = {'depth': ('depth',), 'segmentation': ('segmentation',),
               'goal_segmentation': ('goal_segmentation',), 'goal_pose': ('goal_pose', 'overlap'),
               'arrival': ('arrived',), 'distance': ('distance',)}
-# What each teacher tells, and the action by which it drives.
+# Privileged outputs of each teacher; the first is the action by which it drives.
 TEACHERS = {'explorer': ('explorer_action',), 'oracle': ('oracle_action',),
             'routes': ('oracle_action', 'oracle_regret')}
 
@@ -57,7 +57,7 @@ class LearnerConfig:
     teacher_until: float = 0.5  # share of the training at which it has fallen to 0
     imitation_until: float = 0.7  # share of the training at which it has fallen to 0
     # Whom to imitate: one that knows what the robot has seen, or the shortest path, which only a
-    # policy that knows the house by heart can follow: its actions, or (routes) what each action
+    # policy that knows the house can follow: its actions, or (routes) what each action
     # loses, where the simulator knows that.
     teacher: str = 'explorer'
     # The replay memory, used by `REPLAY_TASKS`, and by the image heads if `images_from_replay`.
@@ -109,7 +109,7 @@ class LearnerConfig:
 
     @property
     def privileged(self) -> tuple[str, ...]:
-        """What batches must hold beside the observations."""
+        """What batches must hold in addition to the observations."""
         keys = [key for name in self.tasks for key in PRIVILEGED.get(name, ())]
         return tuple(keys) + (TEACHERS[self.teacher] if self.imitation else ())
 

@@ -25,7 +25,7 @@ def config_over_ros(config: TrainConfig, world: dict, offers: Collection[str], l
         lock_step: the robot is simulated and waits.
 
     Returns:
-        The configuration, and what is left out and why, in words.
+        The configuration, and lines about what is left out and why.
 
     Raises:
         UserError: a device or architecture for which goals must be known before they are seen;
@@ -44,16 +44,16 @@ def config_over_ros(config: TrainConfig, world: dict, offers: Collection[str], l
             raise UserError(rule, received, remedy)
     lost = [name for name in config.tasks if not set(PRIVILEGED.get(name, ())) <= set(offers)
             or name == 'imitation']
-    words = [f'{name} is left out: no topic says {" or ".join(PRIVILEGED.get(name, ("it",)))}'
+    notes = [f'{name} is left out: no topic has {" or ".join(PRIVILEGED.get(name, ("it",)))}'
              for name in lost]
-    words += [f'{name} is left out: no topic says it'
+    notes += [f'{name} is left out: no topic has it'
               for name in ('progress_reward', 'exploration_reward') if world.get(name)]
     if config.start_difficulty < 1:
-        words.append('there is no curriculum: robots start where they are')
+        notes.append('there is no curriculum: robots start where they are')
     if config.pair_minutes:
-        words.append("there are no picture pairs: they are the simulator's")
+        notes.append("there are no picture pairs: they are the simulator's")
     without: dict[str, Any] = dict.fromkeys(lost, 0.0)
     return dataclasses.replace(
         config, **without, teacher_share=0.0, pair_minutes=0.0,
         start_difficulty=1.0, extra_heads=(*config.extra_heads, *(
-            name for name in lost if name != 'imitation'))), words
+            name for name in lost if name != 'imitation'))), notes

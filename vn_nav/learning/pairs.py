@@ -51,7 +51,7 @@ class PairConfig:
 
     minutes: float = 10.0  # wall-clock, drawing included
     groups: int = 64  # of views, in a step
-    robots: int = 1  # in a group, beside the goal; R make R * (R + 1) pairs
+    robots: int = 1  # in a group, in addition to the goal; R make R * (R + 1) pairs
     learning_rate: float = 1e-3  # at the start; falls linearly to a twentieth
     report_every: int = 200  # steps
     image_weight: float = 0.5  # of the image heads, where the network has some

@@ -1,4 +1,4 @@
-"""A place by heart, before the policy learns there: where pictures were taken, and the ways."""
+"""Place recognition before the policy learns in a place: where pictures were taken, and paths."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from vn_nav.policy.places import PathAdvice, PlaceClassifier, heading_cells
 
 BATCH = 128  # pictures
 LEARNING_RATE = 1e-3  # of Adam, at the start; falls to a twentieth
-NEAR, TURNED = 0.35, np.radians(20)  # m, rad: a spot and a heading stand for poses about so near
-JUDGED, JUDGED_GOALS = 1024, 32  # pictures
-BANK, ROUTE_BATCH = 8192, 1024  # pictures that ways begin at, at most; ways in a step
-SEED = 1  # of the spots
+# A place cell and a heading stand for poses about so near.
+CELL_RADIUS_M, HEADING_WIDTH_RAD = 0.35, np.radians(20)
+MAX_JUDGED_PICTURES, MAX_JUDGED_GOALS = 1024, 32  # pictures
+MAX_START_PICTURES = 8192  # that paths begin at
+PATH_BATCH = 1024  # paths in a step
+CELL_SEED = 1  # of the place cells
 
 
 class Views(Protocol):
@@ -34,7 +36,7 @@ class Views(Protocol):
 
 def spread_spots(positions: np.ndarray, count: int) -> np.ndarray:
     """[K,2] the middles of K parts that positions [N,2] fall into (k-means)."""
-    cv2.setRNGSeed(SEED)
+    cv2.setRNGSeed(CELL_SEED)
     enough = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     # OpenCV's annotations do not know that it makes the labels where there are none.
     _, _, spots = cv2.kmeans(  # type: ignore[call-overload]
@@ -47,17 +49,17 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
                show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
     """Fit the classifier of a network to a place.
 
-    Cross-entropy with the spots and headings about the true pose (Banino et al. 2018).
+    Cross-entropy with the place cells and headings about the true pose (Banino et al. 2018).
 
     Args:
         network: with `places`, new ones; only they change.
         source: views to learn from.
         judge: views of other pictures of the place.
-        positions: [N,2] m, of all pictures: the spots are spread over them.
+        positions: [N,2] m, of all pictures: the place cells are spread over them.
         minutes: wall-clock time.
-        say: is told how it goes, a few times.
+        say: called with lines about the progress, a few times.
         least: pictures to learn from, however long that takes.
-        show: is told the share that is over before every step, and may raise there.
+        show: called before every step with the share that is over; it may raise.
 
     Returns:
         Medians on the other pictures: `metres` and `degrees` off, and `pictures` learned from.
@@ -69,7 +71,7 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
         layer.requires_grad_(True)
     optimiser = torch.optim.Adam([part for layer in learned for part in layer.parameters()],
                                  LEARNING_RATE)
-    begun, seen, told = time.monotonic(), 0, 0
+    begun, seen, reports = time.monotonic(), 0, 0
     try:
         while (share := _share((time.monotonic() - begun) / (60 * minutes), seen, least)) < 1:
             show(share)
@@ -84,13 +86,13 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
             loss.backward()
             optimiser.step()
             seen += BATCH
-            if share >= (told + 1) / 3:
-                told += 1
-                say(_words(seen, *errors(network, judge)))
+            if share >= (reports + 1) / 3:
+                reports += 1
+                say(_summary(seen, *errors(network, judge)))
     finally:
         places.requires_grad_(False)
     metres, degrees = errors(network, judge)
-    say(_words(seen, metres, degrees))
+    say(_summary(seen, metres, degrees))
     return {'metres': metres, 'degrees': degrees, 'pictures': seen}
 
 
@@ -107,9 +109,9 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
         pictures: [N,3,S,S] uint8 where ways begin; goals: [G,3,S,S] where they end.
         regrets: [G,N,A] decisions that each first action loses.
         until: `time.monotonic()` at which to end.
-        say: is told how it went.
+        say: called with a summary line.
         least: ways to learn from, however long that takes.
-        show: is told the share that is over before every step, and may raise there.
+        show: called before every step with the share that is over; it may raise.
 
     Returns:
         `regret`: decisions that the most advised first action loses on average; `ways`: how many
@@ -125,15 +127,15 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
         show(share)
         for group in optimiser.param_groups:
             group['lr'] = LEARNING_RATE * (1 - 0.95 * share)
-        goal, row = (torch.randint(size, (ROUTE_BATCH,), generator=generator)
+        goal, row = (torch.randint(size, (PATH_BATCH,), generator=generator)
                      for size in labels.shape[:2])
         loss = F.cross_entropy(routes(here[row], there[goal])[1],
                                softened(labels[goal, row].float()))
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
-        seen += ROUTE_BATCH
-    some = torch.randperm(len(labels), generator=generator)[:JUDGED_GOALS]
+        seen += PATH_BATCH
+    some = torch.randperm(len(labels), generator=generator)[:MAX_JUDGED_GOALS]
     lost = _regret(network, here, there[some], labels[some])
     say(f'ways: {seen:,} · the advised action loses {lost:.2f} decisions on average')
     return {'regret': lost, 'ways': seen}
@@ -173,7 +175,7 @@ def _regret(network: Policy, here: Tensor, there: Tensor, labels: Tensor) -> flo
 @torch.no_grad()
 def errors(network: Policy, views: Views) -> tuple[float, float]:
     """Medians of how far off the mean pose is [m], [deg]."""
-    pictures, poses = views.draw(JUDGED)
+    pictures, poses = views.draw(MAX_JUDGED_PICTURES)
     found = _places(network).pose(recognise(network, pictures)).numpy()
     off = np.hypot(*(found[:, :2] - poses[:, :2]).T)
     turned = np.abs(wrap_angle(found[:, 2] - poses[:, 2]))
@@ -185,10 +187,10 @@ def _targets(spots: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
     gap = torch.cdist(poses[:, :2].float(), spots)
     turn = poses[:, 2:].float() - heading_cells()
     turn = torch.atan2(torch.sin(turn), torch.cos(turn))
-    return (torch.softmax(-0.5 * (gap / NEAR)**2, dim=1),
-            torch.softmax(-0.5 * (turn / TURNED)**2, dim=1))
+    return (torch.softmax(-0.5 * (gap / CELL_RADIUS_M)**2, dim=1),
+            torch.softmax(-0.5 * (turn / HEADING_WIDTH_RAD)**2, dim=1))
 
 
-def _words(seen: int, metres: float, degrees: float) -> str:
+def _summary(seen: int, metres: float, degrees: float) -> str:
     return (f'places: {seen:,} pictures · on others: {metres:.2f} m, {degrees:.0f} deg off '
             '(medians)')

@@ -34,19 +34,19 @@ def _is_finite(value) -> bool:
             and math.isfinite(value))
 
 
-# What a field may be: words for people, and the test.
+# What a field may be: a text for people, and the test.
 KINDS: dict[type, tuple] = {
     bool: ('true or false', lambda value: isinstance(value, bool)),
     int: ('a whole number', lambda value: _is_finite(value) and value == int(value)),
     float: ('a number', _is_finite),
-    str: ('a word', lambda value: isinstance(value, str)),
+    str: ('a text', lambda value: isinstance(value, str)),
 }
 BAG_WEIGHTS = ('bag_imitation', 'bag_goal_pose', 'bag_arrival', 'bag_distance', 'bag_image')
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(LearnerConfig):
-    """All numbers of a training, beside those of the environment."""
+    """All numbers of a training, without those of the environment."""
 
     preset: str = 'fast'  # where the numbers come from
     frames: int = 3_000_000  # agent decisions; the linear schedules end here
@@ -61,7 +61,7 @@ class TrainConfig(LearnerConfig):
     stacked_frames: int = 1
     deconvolutions: int | None = None  # None: one below `LARGE` pixels, else two (table 5.1)
     pose_to_memory: bool = False
-    places: int = 0  # spots of a place that `vn_nav teach` has taught
+    places: int = 0  # place cells of a place that `vn_nav teach` has taught
     track_goal: bool = False  # by dead reckoning, see `vn_nav.policy.memory.GoalTracker`
     # Whether a policy that tracks its goal acts behind the filter of blocked actions, in rollouts
     # and wherever its checkpoint is used, see `vn_nav.policy.action_filter`.
@@ -76,15 +76,16 @@ class TrainConfig(LearnerConfig):
     pair_minutes: float = 0.0
     pair_houses: int = 256
     pair_learning_rate: float = 1e-3  # at the start
-    # Bags beside rollouts, see `vn_nav.learning.bag_mix`: steps of drives for each step of a
-    # rollout, and the weights of their losses.
+    # Bags in addition to rollouts, see `vn_nav.learning.bag_mix`: steps of drives for each step of
+    # a rollout, and the weights of their losses.
     bag_share: float = 0.25
     bag_imitation: float = 0.1  # at the start; falls to 0 at `imitation_until`
     bag_goal_pose: float = 0.5
     bag_arrival: float = 0.2
     bag_distance: float = 0.1
     bag_image: float = 0.1  # of each image head whose key the bags have
-    # Heads beside those of the tasks: of a checkpoint to begin with, taught by bags or by nobody.
+    # Heads in addition to those of the tasks: of a checkpoint to begin with. Bags teach them, or
+    # nothing does.
     extra_heads: tuple[str, ...] = ()
     curriculum: str = 'success'  # or 'frames': what raises the difficulty
     start_difficulty: float = 0.3  # tau of the curriculum; 1 switches it off
@@ -236,15 +237,15 @@ def _value(name: str, value, kind):
             return None
         (kind,) = (option for option in options if option is not type(None))
     if kind in KINDS:
-        words, fits = KINDS[kind]
+        wanted, fits = KINDS[kind]
         if fits(value):
             return kind(value)
     else:  # a tuple of so many, or of any number
         parts = typing.get_args(kind)
         many = parts[-1] is ...
-        words, fits = KINDS[parts[0]]
-        words = f'a list; each of its {"" if many else f"{len(parts)} "}parts is {words}'
+        wanted, fits = KINDS[parts[0]]
+        wanted = f'a list; each of its {"" if many else f"{len(parts)} "}parts is {wanted}'
         if isinstance(value, (tuple, list)) and (many or len(value) == len(parts)) and all(
                 map(fits, value)):
             return tuple(value)
-    raise UserError(f'{name} is {words}', repr(value), f'correct the value of {name}')
+    raise UserError(f'{name} is {wanted}', repr(value), f'correct the value of {name}')

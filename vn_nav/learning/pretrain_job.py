@@ -13,15 +13,17 @@ from typing import Any
 
 import torch
 
-from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
+from vn_nav.bags.dataset import DriveSet, Wanted
 from vn_nav.bags.drive import RECORDED
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.mapping.recorded_place import scene_of
 from vn_nav.bags.roles import Topics
 from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split
 from vn_nav.learning.precision import fast_dtype
 from vn_nav.learning.presets import TrainConfig, preset
-from vn_nav.learning.pretraining import PretrainConfig, choose_parts, pretrain_network
+from vn_nav.learning.pretrain_config import PretrainConfig, choose_parts
+from vn_nav.learning.pretraining import pretrain_network
 from vn_nav.learning.supervised import PARTS
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.policy.network import Policy
@@ -29,7 +31,7 @@ from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 RANDOM_POSES = 'random'  # the entry `poses` of the topic scene in bags of `vn_nav collect`
-SIZE = 84  # pixels a side of the pictures, unless told otherwise
+SIZE = 84  # pixels a side of the pictures, by default
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +93,9 @@ def pretrain(job: PretrainJob, *, say: Callable[[str], None] = print_line) -> Pa
     robot, network = _robot_and_network(job, given, train)
     drives, worlds = load_bags(bags, robot, network.size, job.topics,
                                Path(job.cache or out / 'decoded'), say)
-    parts, words = choose_parts(drives, job.heads, network.heads, job.cloning)
-    told = split(drives, numbers.validation_share, numbers.seed)
-    for line in (*words, told.words, f'learns {", ".join(parts).replace("_", " ")}'):
+    parts, notes = choose_parts(drives, job.heads, network.heads, job.cloning)
+    divided = split(drives, numbers.validation_share, numbers.seed)
+    for line in (*notes, divided.summary, f'learns {", ".join(parts).replace("_", " ")}'):
         say(line)
     torch.set_num_threads(train.threads)
     policy = _policy(network, parts, given, numbers.seed).to(train.device)
@@ -102,15 +104,15 @@ def pretrain(job: PretrainJob, *, say: Callable[[str], None] = print_line) -> Pa
         'world_version': worlds.pop() if len(worlds) == 1 else RECORDED,
         'camera_fov_deg': math.degrees(robot.camera_fov), 'camera_height': robot.camera_height,
         'preset': train.preset, 'command': job.command,
-        'data': _data(bags, drives, told, Path(job.init) if job.init else None),
+        'data': _data(bags, drives, divided, Path(job.init) if job.init else None),
         'notes': f'Pre-trained on {len(drives):,} steps of {len(job.bags)} bag'
                  f'{"s" * (len(job.bags) > 1)}: {", ".join(parts).replace("_", " ")}; '
-                 f'{told.words}. Losses and figures are of these recorded steps, not of driving; '
-                 'a guess without pictures says the most frequent action and the mean pose of the '
-                 'steps that were learned from.'}
+                 f'{divided.summary}. Losses and figures are of these recorded steps, not of '
+                 'driving; a guess without pictures says the most frequent action and the mean '
+                 'pose of the steps that were learned from.'}
     for line in _legend(parts):
         say(line)
-    return pretrain_network(policy, drives, parts, told, out, numbers, info=info,
+    return pretrain_network(policy, drives, parts, divided, out, numbers, info=info,
                             resume=job.resume, on_epoch=lambda row: say(_epoch_line(row)))
 
 
@@ -181,13 +183,13 @@ def _policy(network: NetworkConfig, parts: Sequence[str], given: LoadedCheckpoin
     return policy
 
 
-def _data(bags: Sequence[Path], drives: Drives, told: Split, init: Path | None) -> str:
+def _data(bags: Sequence[Path], drives: Drives, divided: Split, init: Path | None) -> str:
     """Where the pictures came from, and how many."""
     held = sum(part.facts['pictures'] for part in drives.sets)
     begun = f'; begun with the weights of {init}' if init else ''
     return (f'{held:,} recorded pictures of {", ".join(bag.name for bag in bags)}: '
-            f'{len(rows_of(told.train)):,} steps to learn from, {len(rows_of(told.validation)):,} '
-            f'others to judge by{begun}')
+            f'{len(rows_of(divided.train)):,} steps to learn from, '
+            f'{len(rows_of(divided.validation)):,} others to judge by{begun}')
 
 
 def _legend(parts: Sequence[str]) -> list[str]:
@@ -206,12 +208,12 @@ def _legend(parts: Sequence[str]) -> list[str]:
 
 def _describe(bag: Path, drives: DriveSet, wanted: Wanted) -> str:
     facts = drives.facts
-    words = (f'{bag}: {len(drives):,} steps of {facts["pictures"]:,} pictures in '
-             f'{facts["episodes"]:,} episodes')
+    summary = (f'{bag}: {len(drives):,} steps of {facts["pictures"]:,} pictures in '
+               f'{facts["episodes"]:,} episodes')
     if wanted.every:
-        return f'{words}; from random poses, so without actions'
+        return f'{summary}; from random poses, so without actions'
     done = ', '.join(f'{name} {count:,}' for name, count in facts['actions'].items()) or 'none'
-    return f'{words}; actions: {done}; {facts["misfit_share"]:.0%} of the motions fit none'
+    return f'{summary}; actions: {done}; {facts["misfit_share"]:.0%} of the motions fit none'
 
 
 def _epoch_line(row: dict) -> str:
@@ -224,11 +226,11 @@ def _epoch_line(row: dict) -> str:
         guess = row.get(f'baseline_{name}', math.nan)
         guess = '' if math.isnan(guess) else f'; {guess:{form}}'
         return f'{own}({format(row[f"validation_{name}"], form)}{guess})'
-    words = [f'epoch {row["epoch"]} · {row["minutes"]:.1f} min', f'loss {both("loss", ".3f")}']
-    words += [f'{part.replace("_", " ")} {both(f"{part}_loss", ".3f")}' for part in PARTS
-              if not math.isnan(row[f'validation_{part}_loss'])]
+    figures = [f'epoch {row["epoch"]} · {row["minutes"]:.1f} min', f'loss {both("loss", ".3f")}']
+    figures += [f'{part.replace("_", " ")} {both(f"{part}_loss", ".3f")}' for part in PARTS
+                if not math.isnan(row[f'validation_{part}_loss'])]
     for name, label, form in (('action_accuracy', 'right actions', '.0%'),
                               ('bearing_deg', 'bearing off by deg', '.0f')):
         if not math.isnan(row[f'validation_{name}']):
-            words.append(f'{label} {both(name, form)}')
-    return ' · '.join(words)
+            figures.append(f'{label} {both(name, form)}')
+    return ' · '.join(figures)

@@ -23,19 +23,11 @@ from vn_nav.errors import UserError
 from vn_nav.files import write_file
 from vn_nav.learning.hindsight import Drives, Split, draw_windows, partners, rows_of
 from vn_nav.learning.log import METRICS
+from vn_nav.learning.pretrain_config import PretrainConfig
 from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
-from vn_nav.learning.supervised import (
-    BY_WINDOW,
-    FIGURES,
-    NEEDS,
-    PARTS,
-    Batch,
-    Objective,
-    Tally,
-)
+from vn_nav.learning.supervised import FIGURES, PARTS, Batch, Objective, Tally
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network import Policy
-from vn_nav.policy.network_config import IMAGE_HEADS
 
 STATE, CHECKPOINT = 'pretrain_state', 'checkpoint'
 # frames, minutes, tau and success are what `vn_nav compare` asks for; no episode is driven here.
@@ -43,103 +35,12 @@ COLUMNS = ('frames', 'minutes', 'tau', 'success', 'epoch',
            *(f'{where}{name}' for where in ('', 'validation_')
              for name in ('loss', *(f'{part}_loss' for part in PARTS), *FIGURES)),
            *(f'baseline_{name}' for name in FIGURES))
-JUDGED = 1024  # pairs, and steps of windows, of a validation at most
-AT_A_TIME = 64  # pairs of a validation
-GUESSED = 1_000_003  # of the random numbers by which pairs are drawn for the baseline
+MAX_VALIDATION_STEPS = 1024  # pairs, and steps of windows, of a validation
+VALIDATION_BATCH = 64  # pairs
+BASELINE_STREAM = 1_000_003  # of the random numbers that draw pairs for the baseline
 
 
-@dataclasses.dataclass(frozen=True)
-class PretrainConfig:
-    """Numbers of the pre-training."""
-
-    epochs: int = 30  # thesis, table 5.1
-    batch: int = 32  # pairs of pictures in a step of the optimiser
-    learning_rate: float = 1e-3  # at the start; falls linearly to a twentieth
-    window: int = 16  # steps
-    farthest: int = 48  # steps from a window's first one to its goal
-    validation_share: float = 0.1
-    # Weights of the losses; of one image head: `image`.
-    image: float = 1.0
-    goal_pose: float = 1.0
-    cloning: float = 1.0
-    arrival: float = 0.5
-    distance: float = 0.2
-    max_gradient_norm: float = 1.0
-    save_seconds: float = 30.0
-    seed: int = 0
-
-    def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.name != 'seed' and not value > 0:
-                raise UserError(f'{field.name} of a pre-training is positive', value, 'correct it')
-        if self.validation_share >= 1:
-            raise UserError('the share of the validation is below 1', self.validation_share,
-                            'leave something to learn from')
-        if self.seed < 0:
-            raise UserError('the seed of a pre-training is not negative', self.seed, 'correct it')
-
-    def weight(self, part: str) -> float:
-        """Of a part of the loss."""
-        return self.image if part in IMAGE_HEADS else getattr(self, part)
-
-
-def choose_parts(drives: Drives, asked: Sequence[str] | None, own: Sequence[str],
-                 cloning: bool | None) -> tuple[tuple[str, ...], list[str]]:
-    """What can be learned from some drives.
-
-    Args:
-        drives: the bags.
-        asked: heads; None: those whose keys the bags have and, of the others, the network's own.
-        own: heads of the network.
-        cloning: of the actions; None: where there are any.
-
-    Returns:
-        Some of `PARTS`, and what is left out and why, in words.
-
-    Raises:
-        UserError: no such head, cloning without actions, or nothing to learn.
-    """
-    heads = [part for part in PARTS if part != 'cloning']
-    if asked is not None and not set(asked) <= set(heads):
-        raise UserError(f'heads to pre-train are some of {", ".join(heads)}', ', '.join(asked),
-                        'correct --heads')
-    acts = bool((drives.action >= 0).any())
-    if cloning and not acts:
-        raise UserError("cloning needs motions that are the robot's actions",
-                        'bags without any', 'give the robot that drove with --robot, or use '
-                        '--no-cloning')
-    cloning = acts if cloning is None else cloning
-    if asked is None:
-        asked = [*NEEDS, *(name for name in ('goal_pose', *BY_WINDOW) if name in own)]
-        if not (drives.has['depth'].any() or drives.has['labels'].any()):
-            asked.append('reconstruction')
-    parts, words = [], []
-    for name in PARTS:
-        if name == 'cloning':
-            if cloning:
-                parts.append(name)
-            continue
-        if name not in asked:
-            continue
-        known = drives.has[NEEDS[name]] if name in NEEDS else np.ones(1, bool)
-        topic = f'{NEEDS.get(name)}/image_raw'
-        if not known.any():
-            words.append(f'{name} is left out: no bag has {topic} beside all its pictures')
-        elif name in BY_WINDOW and not cloning:
-            words.append(f'{name} is left out: it is learned along the actions of a drive')
-        else:
-            parts.append(name)
-            if not known.all():
-                words.append(f'{name} learns from {known.mean():.0%} of the pictures: the others '
-                             f'lack {topic}')
-    if not parts:
-        raise UserError('there is something to pre-train', '; '.join(words) or 'no head, and no '
-                        'cloning', 'choose other --heads, or other bags')
-    return tuple(parts), words
-
-
-def pretrain_network(network: Policy, drives: Drives, parts: Sequence[str], told: Split,
+def pretrain_network(network: Policy, drives: Drives, parts: Sequence[str], split: Split,
                      folder: Path, config: PretrainConfig, *, info: dict, resume: bool = False,
                      on_epoch: Callable[[dict], None] | None = None) -> Path:
     """Train a network on drives, and keep the weights of the epoch that does best on the others.
@@ -150,7 +51,7 @@ def pretrain_network(network: Policy, drives: Drives, parts: Sequence[str], told
         network: with a head for each of the parts; changed in place.
         drives: the bags.
         parts: some of `PARTS`, see `choose_parts`.
-        told: which episodes are for what.
+        split: which episodes are for what.
         folder: gets `checkpoint/`, `pretrain_state` (at least every `save_seconds`) and
             `metrics.csv`.
         config: numbers.
@@ -165,28 +66,28 @@ def pretrain_network(network: Policy, drives: Drives, parts: Sequence[str], told
         UserError: a folder or resumption that does not fit, a loss that is not finite, or a full
             disk.
     """
-    return _Pretraining(network, drives, parts, told, folder, config, info).run(resume, on_epoch)
+    return _Pretraining(network, drives, parts, split, folder, config, info).run(resume, on_epoch)
 
 
 class _Pretraining:
     """Everything that changes, and its save file."""
 
-    def __init__(self, network, drives, parts, told, folder, config, info):
+    def __init__(self, network, drives, parts, split, folder, config, info):
         self.network, self.drives, self.config, self.info = network, drives, config, info
-        self.told, self.folder = told, Path(folder)
+        self.split, self.folder = split, Path(folder)
         self.objective = Objective(network, drives, parts, config.window)
         self.parameters = [part for part in network.parameters() if part.requires_grad]
         self.optimiser = torch.optim.Adam(self.parameters, config.learning_rate)
-        self.rows = rows_of(told.train)
+        self.rows = rows_of(split.train)
         self.steps = -(-len(self.rows) // config.batch)  # of an epoch
         self.epoch = self.step = 0
         self.seconds = 0.0
         self.metrics: list[dict] = []  # a row an epoch, before the first one too
         self.best: dict = {'loss': math.inf, 'epoch': 0, 'weights': None}
         self.tally = Tally()  # of the present epoch
-        rng = np.random.default_rng((config.seed, GUESSED))
-        some = np.sort(rng.permutation(len(self.rows))[:JUDGED])
-        self.guess = self.objective.guess(self.rows[some], partners(told.train, rng)[some],
+        rng = np.random.default_rng((config.seed, BASELINE_STREAM))
+        some = np.sort(rng.permutation(len(self.rows))[:MAX_VALIDATION_STEPS])
+        self.guess = self.objective.guess(self.rows[some], partners(split.train, rng)[some],
                                           drives.action[self.rows])
 
     def run(self, resume: bool, on_epoch) -> Path:
@@ -217,7 +118,7 @@ class _Pretraining:
 
     def _epoch(self) -> Iterator[Batch]:
         """The batches of the present epoch, a function of the seed and its number."""
-        config, train = self.config, self.told.train
+        config, train = self.config, self.split.train
         rng = np.random.default_rng((config.seed, self.epoch))
         order = rng.permutation(len(self.rows))
         goals = partners(train, rng)
@@ -255,20 +156,20 @@ class _Pretraining:
 
         And those of the best guess on the same ones.
         """
-        config, spans = self.config, self.told.validation
+        config, spans = self.config, self.split.validation
         rng = np.random.default_rng(config.seed)
         rows, goals = rows_of(spans), partners(spans, rng)
-        some = np.sort(rng.permutation(len(rows))[:JUDGED])
+        some = np.sort(rng.permutation(len(rows))[:MAX_VALIDATION_STEPS])
         tally = Tally()
         if self.objective.paired:
-            for part in np.array_split(some, -(-len(some) // AT_A_TIME)):
+            for part in np.array_split(some, -(-len(some) // VALIDATION_BATCH)):
                 self.objective.losses(Batch(rows[part], goals[part], None), tally)
         if self.objective.windowed:
             windows = rng.permutation(
                 draw_windows(self.drives, spans, config.window, config.farthest, rng))
-            windows = windows[:max(JUDGED // config.window, 1)]
-            for first in range(0, len(windows), max(AT_A_TIME // config.window, 1)):
-                part = windows[first:first + max(AT_A_TIME // config.window, 1)]
+            windows = windows[:max(MAX_VALIDATION_STEPS // config.window, 1)]
+            for first in range(0, len(windows), max(VALIDATION_BATCH // config.window, 1)):
+                part = windows[first:first + max(VALIDATION_BATCH // config.window, 1)]
                 self.objective.losses(Batch(None, None, part), tally)
         return tally.figures(config.weight), tally.baseline(self.guess)
 

@@ -1,200 +1,27 @@
-"""The replay memory of A2CAT-VN: the last steps of every environment, in uint8.
-
-A ring of rows, each with all environments side by side. A row holds one observation and what came
-of the action there; the observation that follows is the next row. So a rollout's last observation
-is not stored with it, but as the first row of the next rollout, and the newest row's action is
-drawn only once that row is there. The rows are numbered since training began (their serial); row
-s lies in the ring at s modulo the capacity.
-
-`age` counts an observation's place in its episode. Two neighbouring rows belong to one episode
-where it grows by one, which is all that drawing needs to know about episodes.
-"""
+"""The replay memory of A2CAT-VN: windows and reward frames out of the stored steps."""
 
 from __future__ import annotations
-
-import hashlib
-import math
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from vn_nav.errors import UserError
-from vn_nav.learning.replay_files import RingFiles
+from vn_nav.learning.replay_rings import ReplayRings
 from vn_nav.learning.rollout import Rollout
 from vn_nav.observation import Observation
 
-PICTURES = ('depth', 'segmentation')  # what may be kept beside the observation, [S,S] uint8
-LAYOUT = 1  # of the files
 
-
-def encode_depth(depth: Tensor, max_depth: float = 10.0) -> Tensor:
-    """Metric depth [m] as uint8, 255 at `max_depth` and beyond; uint8 passes unchanged."""
-    if depth.dtype == torch.uint8:
-        return depth
-    levels = (depth * (255.0 / max_depth)).nan_to_num_(255.0)
-    return levels.clamp_(0.0, 255.0).round_().to(torch.uint8)
-
-
-class Replay:
+class Replay(ReplayRings):
     """The last `capacity` steps of every environment (thesis 4.3: replay of UNREAL).
 
     Everything drawn comes from stored steps with equal probability, with replacement; equal
-    generators draw equal batches.
-
-    Args:
-        capacity: rows kept, that is steps of each environment (2,000 in the thesis).
-        num_envs: environments, N.
-        size: side of the square pictures, S [pixels].
-        goals: [G,3,S,S] uint8, the table that every rollout's `goal_index` points into; kept by
-            reference, once. None: a task without goal pictures.
-        privileged: which of `PICTURES` the rollouts bring and the memory keeps.
-        goal_segmentation: [G,S,S] uint8 classes of the goal pictures, if an image head needs
-            them: looked up like the goals, not kept for each step.
-        max_depth: depth that is stored as 255 [m].
-        directory: where the rings live as memory-mapped files, so that a resumed training finds
-            them. They survive a killed process at any moment; for a power cut call `flush`
-            before the checkpoint is written. None: in memory only.
-        device: where the rings live and the draws are made; files need the CPU.
-
-    Attributes:
-        count: rows that can be read.
-        resumed: 'mapped' or 'refilled' after `load_state_dict`: whether the stored steps were
-            found again, or have to be collected anew. None before.
-
-    Raises:
-        UserError: sizes that make no memory, files of another memory, or a full disk.
+    generators draw equal batches. Arguments and errors are those of `ReplayRings`.
     """
-
-    def __init__(self, capacity: int, num_envs: int, size: int, goals: Tensor | None, *,
-                 privileged: tuple[str, ...] = PICTURES, goal_segmentation: Tensor | None = None,
-                 max_depth: float = 10.0, directory: Path | None = None,
-                 device: torch.device | str = 'cpu'):
-        if capacity < 2 or num_envs < 1:
-            raise UserError('a replay memory keeps at least two steps of one environment',
-                            (capacity, num_envs), 'make it larger')
-        if directory is not None and torch.device(device).type != 'cpu':
-            raise UserError('a memory-mapped replay lives on the CPU', str(device),
-                            'leave out the directory or the device')
-        self.capacity, self.num_envs, self.size = capacity, num_envs, size
-        self.goals, self.goal_segmentation = goals, goal_segmentation
-        self.privileged, self.max_depth = tuple(privileged), max_depth
-        self.device = torch.device(device)
-        self.resumed: str | None = None
-        self.total = self.count = 0  # rows ever appended; readable ones, the newest of them
-        self._steps: dict[int, tuple[Tensor, Tensor]] = {}
-        layout = self._layout(capacity, num_envs, size, self.privileged)
-        self._files = (None if directory is None
-                       else RingFiles(Path(directory), self._header()))
-        if self._files is None:
-            self.rings = {name: torch.zeros(shape, dtype=dtype, device=self.device)
-                          for name, (dtype, shape) in layout.items()}
-        else:
-            self.rings = self._files.open(layout)
-
-    @staticmethod
-    def _layout(capacity: int, num_envs: int, size: int, privileged: tuple[str, ...]
-                ) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
-        """Type and shape of every ring."""
-        for name in privileged:
-            if name not in PICTURES:
-                raise UserError(f'the replay memory keeps {" and ".join(PICTURES)}', name,
-                                'leave it out')
-        picture, row = (size, size), (capacity, num_envs)
-        return {
-            'serial': (torch.int64, (capacity,)),
-            'image': (torch.uint8, (*row, *picture, 3)),  # as the convolutions read them
-            **{name: (torch.uint8, (*row, *picture)) for name in privileged},
-            'age': (torch.int32, row),
-            'goal_index': (torch.int32, row),
-            'last_action': (torch.int16, row),
-            'last_reward': (torch.float32, row),
-            'action': (torch.int16, row),
-            'reward': (torch.float32, row),
-            **{name: (torch.bool, row) for name in ('starts', 'terminated', 'truncated', 'valid')},
-        }
-
-    @classmethod
-    def bytes_needed(cls, capacity: int, num_envs: int, size: int,
-                     privileged: tuple[str, ...] = PICTURES) -> int:
-        """Bytes of such a memory's rings, without making it."""
-        return sum(math.prod(shape) * dtype.itemsize for dtype, shape in
-                   cls._layout(capacity, num_envs, size, privileged).values())
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the rings; the goal tables are their owner's."""
-        return sum(ring.nbytes for ring in self.rings.values())
 
     @property
     def steps(self) -> int:
         """Stored steps of all environments that can be drawn."""
         return sum(len(part) for part in self._stored_steps(1)) if self.count else 0
-
-    def extend(self, rollout: Rollout) -> None:
-        """Append the T steps of a rollout; its last observation comes with the next rollout.
-
-        Raises:
-            UserError: another number of environments, another goal table, a missing privileged
-                picture, or more steps than the memory keeps.
-        """
-        steps, envs = rollout.action.shape
-        seen = rollout.observation
-        if envs != self.num_envs or steps > self.capacity:
-            raise UserError(f'a rollout has {self.num_envs} environments and at most '
-                            f'{self.capacity} steps', (steps, envs), 'make the memory larger')
-        self._check_goals(seen.goals)
-        for name in self.privileged:
-            if name not in rollout.privileged:
-                raise UserError(f'rollouts bring {name}', sorted(rollout.privileged),
-                                'let the environment give it, or do not keep it')
-        rows = {
-            'image': seen.image.permute(0, 1, 3, 4, 2),
-            **{name: rollout.privileged[name] for name in self.privileged},
-            'goal_index': seen.goal_index, 'last_action': seen.last_action,
-            'last_reward': seen.last_reward, 'starts': rollout.starts,
-            'action': rollout.action, 'reward': rollout.reward, 'valid': rollout.valid,
-            'terminated': rollout.terminated, 'truncated': rollout.truncated,
-            'age': self._ages(rollout.starts[:steps]),
-        }
-        if 'depth' in rows:
-            rows['depth'] = encode_depth(rows['depth'][:steps], self.max_depth)
-        if not self.total:
-            self._take_over()
-        serial = torch.arange(self.total, self.total + steps, device=self.device)
-        # The serial last: a process killed in between leaves rows that nobody trusts.
-        self._write('serial', torch.full_like(serial, -1))
-        for name, part in rows.items():
-            self._write(name, part[:steps])
-        self._write('serial', serial)
-        self.total += steps
-        self.count = min(self.count + steps, self.capacity)
-        self._steps.clear()
-
-    def _check_goals(self, goals: Tensor | None) -> None:
-        if goals is None and self.goals is None:
-            return
-        if goals is None or self.goals is None or goals.shape != self.goals.shape or not (
-                goals.data_ptr() == self.goals.data_ptr()
-                or torch.equal(goals, self.goals.to(goals.device))):
-            raise UserError("rollouts point into the memory's own table of goals",
-                            None if goals is None else tuple(goals.shape),
-                            'make a memory for each table')
-
-    def _ages(self, starts: Tensor) -> Tensor:
-        """Place in the episode [T,N] of rows that follow the newest one."""
-        starts = starts.to(self.device)
-        t = torch.arange(len(starts), device=self.device)[:, None]
-        began = torch.where(starts, t, -1).cummax(0).values
-        before = (self.rings['age'][(self.total - 1) % self.capacity].long() if self.count
-                  else torch.full_like(t[0], -1))
-        return torch.where(began >= 0, t - began, before + 1 + t)
-
-    def _write(self, name: str, rows: Tensor) -> None:
-        ring, at = self.rings[name], self.total % self.capacity
-        head = min(len(rows), self.capacity - at)
-        ring[at:at + head].copy_(rows[:head])
-        ring[:len(rows) - head].copy_(rows[head:])
 
     def windows(self, batch: int, length: int, generator: torch.Generator) -> Rollout:
         """Stretches of episodes, one a column.
@@ -297,72 +124,8 @@ class Replay:
                                      device=self.device)]
         return chosen // self.num_envs, chosen % self.num_envs
 
-    def _position(self, row: Tensor) -> Tensor:
-        """Where rows counted from the oldest lie in the rings."""
-        return (self.total - self.count + row) % self.capacity
-
-    def _read(self, name: str, row: Tensor, env: Tensor) -> Tensor:
-        """Values at rows counted from the oldest; the newest row stands for those after it."""
-        place = self._position(row.clamp(max=self.count - 1)) * self.num_envs + env
-        ring = self.rings[name].flatten(0, 1)
-        return ring.index_select(0, place.flatten()).view(*place.shape, *ring.shape[1:])
-
     def _observations(self, rows: Tensor, env: Tensor) -> Observation:
         return Observation(
             self._read('image', rows, env).permute(0, 1, 4, 2, 3), self.goals,
             self._read('goal_index', rows, env).long(),
             self._read('last_action', rows, env).long(), self._read('last_reward', rows, env))
-
-    # Files, and resuming from them.
-
-    def state_dict(self) -> dict:
-        """Where the memory stands; the steps themselves stay in the files."""
-        return {'total': self.total, 'count': self.count, 'identity': self.identity}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on where `state_dict` was taken, from the files, or empty where there are none.
-
-        Rows written after that moment, and all before such a row, are not trusted: the present
-        training writes other ones.
-
-        Raises:
-            UserError: the files belong to another training.
-        """
-        self._steps.clear()
-        self.total = self.count = 0
-        self.resumed = 'refilled'
-        if not self.identity or not state['total']:
-            return
-        if self._files is not None and state['identity'] != self.identity:
-            raise UserError('a training goes on with its own replay files',
-                            f'files of {self.identity} in {self._files.directory}',
-                            'remove that folder: the memory is then filled anew')
-        newest_first = torch.arange(state['total'] - 1, state['total'] - 1 - state['count'], -1)
-        kept = self.rings['serial'][newest_first % self.capacity] == newest_first
-        count = int(kept.long().cumprod(0).sum())
-        if count:
-            self.total, self.count, self.resumed = state['total'], count, 'mapped'
-
-    @property
-    def identity(self) -> str:
-        """Of the training that the rings belong to; empty: they are in no files."""
-        return '' if self._files is None else self._files.identity
-
-    def flush(self) -> None:
-        """Write the mapped files to the disk."""
-        if self._files is not None:
-            self._files.flush()
-
-    def _header(self) -> dict:
-        digest = hashlib.sha256()
-        for table in (self.goals, self.goal_segmentation):
-            if table is not None:
-                digest.update(table.cpu().numpy().tobytes())
-        return {'layout': LAYOUT, 'capacity': self.capacity, 'num_envs': self.num_envs,
-                'size': self.size, 'privileged': list(self.privileged),
-                'max_depth': self.max_depth, 'goals': digest.hexdigest()}
-
-    def _take_over(self) -> None:
-        self.rings['serial'].fill_(-1)
-        if self._files is not None:
-            self._files.take_over()

@@ -19,8 +19,9 @@ from torch import Tensor
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.action_filter import make_filter
+from vn_nav.policy.goal_maps import GoalMaps
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import GoalMaps, Policy
+from vn_nav.policy.network import Policy
 from vn_nav.policy.zhu import check_scenes
 from vn_nav.policy.zhu_policy import ScenePolicy
 from vn_nav.vector_env import NavigationVectorEnv, PlacedEnv
@@ -89,7 +90,7 @@ class Collector:
         env: its tensors may change in place with its next step.
         network: the policy; it acts in its `compute_dtype`.
         generator: source of the sampled actions, on the network's device.
-        privileged: keys of the environment's `info` to keep beside the observations.
+        privileged: keys of the environment's `info` to keep with the observations.
     """
 
     def __init__(self, env: NavigationVectorEnv, network: Policy, generator: torch.Generator,
@@ -98,7 +99,7 @@ class Collector:
         self.privileged = privileged
         self.device = network.device
         self.on_device = isinstance(env.goals, Tensor)
-        self.told: dict[str, Tensor] = {}  # beside the present observation
+        self.targets: dict[str, Tensor] = {}  # privileged, of the present observation
         self.goals = self._tensor(env.goals)
         if isinstance(network, ScenePolicy):
             self.goals = network.look(self.goals)
@@ -151,15 +152,15 @@ class Collector:
         image = empty(steps + 1, torch.uint8, size, size, 3).permute(0, 1, 4, 2, 3)
         seen = Observation(image, self.goals, empty(steps + 1, whole), empty(steps + 1, whole),
                            empty(steps + 1, real), self._empty_extras(steps + 1))
-        told = {key: empty(steps + 1, rows.dtype, *rows.shape[1:])
-                for key, rows in self.told.items()}
+        targets = {key: empty(steps + 1, rows.dtype, *rows.shape[1:])
+                   for key, rows in self.targets.items()}
         driven = None if teacher is None else empty(steps, flag)
         chosen, value = empty(steps, real), empty(steps + 1, real)
         offsets = None if self._filter is None else empty(
             steps, real, len(self.network.config.actions))
         rollout = Rollout(
             seen, empty(steps + 1, flag), empty(steps, whole), empty(steps, real),
-            empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, told,
+            empty(steps, flag), empty(steps, flag), empty(steps, flag), self.state, targets,
             driven, chosen, value, offsets)
         facts = empty(steps, torch.float64, 1 + len(self._totals))
         goal_maps = self._goal_maps()
@@ -168,8 +169,8 @@ class Collector:
                 if name not in ('goals', 'extras'):
                     rows[t] = self.observation[name]
             self._fill_extras(seen, t)
-            for key, rows in told.items():
-                rows[t] = self.told[key]
+            for key, rows in targets.items():
+                rows[t] = self.targets[key]
             rollout.starts[t] = self.starts
             if teacher is not None:
                 drawn = torch.rand(n, device=self.device, generator=self.generator) < share
@@ -193,7 +194,7 @@ class Collector:
             action = self._sample(log_probability)
             if teacher is not None and driven is not None:
                 driven[t] = self.driven
-                action = torch.where(self.driven[:, None], told[teacher][t][:, None], action)
+                action = torch.where(self.driven[:, None], targets[teacher][t][:, None], action)
             rollout.action[t] = action[:, 0]
             chosen[t] = log_probability.gather(1, action)[:, 0]
             facts[t] = self._step(rollout, t)
@@ -246,14 +247,14 @@ class Collector:
             seen.extras['scene'][t] = self._tensor(check_scenes(scene, self._scenes))
 
     def _see(self, observation: dict, info: dict) -> None:
-        """Keep what the environment shows and tells until the next row."""
+        """Keep the outputs of the environment until the next row."""
         missing = [key for key in self.privileged if key not in info]
         if missing:
-            raise UserError('the environment tells everything that the auxiliary tasks need',
+            raise UserError('the environment gives everything that the auxiliary tasks need',
                             missing, 'list it among its privileged outputs, or set the weight of '
                             'those tasks to 0')
         self.observation = {name: self._tensor(rows) for name, rows in observation.items()}
-        self.told = {key: self._tensor(info[key]) for key in self.privileged}
+        self.targets = {key: self._tensor(info[key]) for key in self.privileged}
 
     def _step(self, rollout: Rollout, t: int) -> Tensor:
         """Step the environment with row t's actions and write down what came of it.
@@ -286,7 +287,8 @@ class Collector:
             return rows.detach().clone().cpu()
         return {
             'observation': {name: copy(rows) for name, rows in self.observation.items()},
-            'told': {key: copy(rows) for key, rows in self.told.items()},
+            # Under the name of earlier states: a training begun with those is resumed.
+            'told': {key: copy(rows) for key, rows in self.targets.items()},
             'starts': copy(self.starts), 'driven': copy(self.driven),
             'memory': [copy(part) for part in self.state],
             'totals': [copy(total) for total in self._totals],
@@ -298,7 +300,7 @@ class Collector:
         """Go on where `state_dict` was taken; the environment must stand there too."""
         self.observation = {name: self._tensor(rows)
                             for name, rows in state['observation'].items()}
-        self.told = {key: self._tensor(rows) for key, rows in state['told'].items()}
+        self.targets = {key: self._tensor(rows) for key, rows in state['told'].items()}
         self.starts = self._tensor(state['starts'])
         self.driven = self._tensor(state['driven'])
         self.state = RecurrentState(*map(self._tensor, state['memory']))

@@ -9,11 +9,11 @@ import threading
 import time
 from typing import Any
 
-EVERY = 10.0  # s between two lines where the output is no terminal
+LINE_PERIOD_S = 10.0  # s between two lines where the output is no terminal
 
 
 class Stages:
-    """Shows which stage of a command is under way, and hears SIGINT and SIGTERM.
+    """Shows which stage of a command is under way, and handles SIGINT and SIGTERM.
 
     Used as a context, in the main thread for the signals. Where it is called with a share, a
     signal that came since raises KeyboardInterrupt: what is changed in between stays whole. A
@@ -27,7 +27,7 @@ class Stages:
         self._total, self._begun = 60 * minutes, time.monotonic()
         self._bar: Any = None
         self._task: Any = None
-        self._stage, self._said = '', self._begun
+        self._stage, self._printed = '', self._begun
         self._before: dict[int, Any] = {}
         self.interrupted = False
 
@@ -48,7 +48,7 @@ class Stages:
     def __enter__(self) -> Stages:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._hear)
+                self._before[number] = signal.signal(number, self._on_signal)
         return self
 
     def __exit__(self, *_) -> None:
@@ -64,13 +64,13 @@ class Stages:
         """
         if self.interrupted:
             raise KeyboardInterrupt
-        words = f'{self.seconds / 60:.1f} of {self._total / 60:g} min · {stage}'
+        line = f'{self.seconds / 60:.1f} of {self._total / 60:g} min · {stage}'
         if sys.stdout.isatty():
-            self._show(words, share)
-        elif stage != self._stage or time.monotonic() - self._said >= EVERY:
+            self._show(line, share)
+        elif stage != self._stage or time.monotonic() - self._printed >= LINE_PERIOD_S:
             if stage != self._stage or share < 1:
-                print(f'{words} · {min(share, 1):.0%}', flush=True)
-            self._said = time.monotonic()
+                print(f'{line} · {min(share, 1):.0%}', flush=True)
+            self._printed = time.monotonic()
         self._stage = stage
 
     def pause(self) -> None:
@@ -79,16 +79,16 @@ class Stages:
             self._bar.stop()
             self._bar = None
 
-    def _show(self, words: str, share: float) -> None:
+    def _show(self, line: str, share: float) -> None:
         if self._bar is None:
             from rich.progress import BarColumn, Progress, TextColumn
             self._bar = Progress(BarColumn(24), TextColumn('{task.percentage:>3.0f}%'),
                                  TextColumn('{task.description}'), transient=True)
-            self._task = self._bar.add_task(words, total=1.0)
+            self._task = self._bar.add_task(line, total=1.0)
             self._bar.start()
-        self._bar.update(self._task, completed=min(share, 1.0), description=words)
+        self._bar.update(self._task, completed=min(share, 1.0), description=line)
 
-    def _hear(self, number: int, frame: Any) -> None:
+    def _on_signal(self, number: int, frame: Any) -> None:
         if self.interrupted:
             raise KeyboardInterrupt
         self.interrupted = True

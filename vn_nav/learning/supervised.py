@@ -21,7 +21,7 @@ from vn_nav.policy.heads import Pose
 from vn_nav.policy.network import Latents, Policy
 from vn_nav.policy.network_config import IMAGE_HEADS
 
-# What an image head needs beside the picture: an array of `DriveSet`.
+# What an image head needs in addition to the picture: an array of `DriveSet`.
 NEEDS = {'depth': 'depth', 'segmentation': 'labels', 'goal_segmentation': 'labels'}
 BY_WINDOW = ('cloning', 'arrival', 'distance')  # what needs a memory, and so windows of steps
 PARTS = (*IMAGE_HEADS, 'goal_pose', *BY_WINDOW)

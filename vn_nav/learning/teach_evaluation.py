@@ -24,9 +24,9 @@ DECODING = 'sample'
 RIGHT = f'right goal, {DECODING}'
 ROWS = (RIGHT, BEFORE, evaluator.RANDOM, evaluator.SHORTEST, evaluator.WRONG)
 WITHOUT_NETWORK = (evaluator.RANDOM, evaluator.SHORTEST)
-SEED = 10_000
-LEAST = 5  # episodes of a row
-TIMED = 3  # steps by which the cost of one is judged
+EVALUATION_SEED = 10_000
+MIN_EPISODES = 5  # episodes of a row
+TIMED_STEPS = 3  # steps by which the cost of one is judged
 
 
 class Row(NamedTuple):
@@ -71,10 +71,10 @@ def rows_of(splits: Sequence[str], network: Policy, before: Policy | None) -> li
 def cost_of(make_env: Callable[[int], Any], network: Policy, envs: int) -> Cost:
     """Drive a few steps, and look at the clock."""
     env = make_env(envs)
-    actor = evaluator.PolicyActor(env, network, DECODING, SEED)
-    observation, info = env.reset(seed=SEED)
+    actor = evaluator.PolicyActor(env, network, DECODING, EVALUATION_SEED)
+    observation, info = env.reset(seed=EVALUATION_SEED)
     times = []
-    for _ in range(1 + TIMED):  # the first one warms up
+    for _ in range(1 + TIMED_STEPS):  # the first one warms up
         begun = time.monotonic()
         actions = actor(observation, info['reset'])
         middle = time.monotonic()
@@ -103,7 +103,7 @@ def plan(rows: Sequence[Row], costs: Sequence[Cost], most: int, seconds: float, 
                                                                    strict=True))
         acting = sum(row.name not in WITHOUT_NETWORK for row in some)
         return rounds * decisions * (acting * act + len(some) * step)
-    least = min(LEAST, most)
+    least = min(MIN_EPISODES, most)
     some = list(rows)
     while len(some) > 1 and needed(some, least) > seconds:
         some.pop()
@@ -146,7 +146,7 @@ class Evaluation:
         envs: dict[tuple[str, str], Any] = {}
         for count, row in enumerate(chosen.rows):
             def show(share: float, count: int = count, row: Row = row) -> None:
-                # A signal is heard also when the minutes are over: below, by `stages`.
+                # A signal counts also when the minutes are over: below, by `stages`.
                 if count and stages.left < 0 and not stages.interrupted:
                     raise _OutOfTime
                 stages(f'evaluation {count + 1} of {len(chosen.rows)}: '
@@ -160,8 +160,8 @@ class Evaluation:
                 env = envs[row[:2]]
                 actor, shown = self._actor(env, row, network, before)
                 env.set_shown_goal(shown)
-                found = evaluator.run_episodes(env, actor, rounds * environments, seed=SEED,
-                                               robot=self.robot, show=show)
+                found = evaluator.run_episodes(env, actor, rounds * environments,
+                                               seed=EVALUATION_SEED, robot=self.robot, show=show)
             except _OutOfTime:
                 left_out = len(chosen.rows) - count
                 print(f'the minutes are over: {left_out} row{"s" * (left_out > 1)} of the '
@@ -174,7 +174,8 @@ class Evaluation:
         controls = (row.name,) if row.name in evaluator.CONTROLS else ()
         drives = before if row.name == BEFORE else network
         assert drives is not None  # `rows_of` lists no row without its policy
-        actors = evaluator.make_actors(env, drives, DECODING, controls, self.threshold, SEED)
+        actors = evaluator.make_actors(env, drives, DECODING, controls, self.threshold,
+                                       EVALUATION_SEED)
         return actors[RIGHT if row.name == BEFORE else row.name]
 
     def _keep(self, row: Row, episodes: list) -> None:

@@ -15,14 +15,14 @@ from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.robot import RobotSpec
 
 PRESET = 'fast'
-# The place is one to know by heart: there the shortest path is something to imitate.
+# The policy shall recognise this place: there the shortest path is something to imitate.
 TEACHER = {'imitation': 1.0, 'imitation_until': 1.0, 'teacher': 'routes', 'teacher_share': 0.5,
            'teacher_until': 0.6, 'start_difficulty': 1.0}
 # Without a checkpoint much is learned from each rollout.
 FROM_NOTHING = {'epochs': 4, 'minibatches': 8, 'learning_rate': 1e-3}
 PAIR_SHARE = 0.1  # of learning from nothing, for picture pairs
-PLACES = 64  # spots that the policy tells apart
-SIZE = 84  # pixels a side of the pictures, unless told otherwise
+PLACES = 64  # place cells that the policy distinguishes
+SIZE = 84  # pixels a side of the pictures, by default
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ class TeachJob:
     minutes: float = 10.0  # that all of it takes: reading the bag, learning, evaluation
     robot: RobotSpec = RobotSpec()  # that drove, with its camera
     options: PlaceOptions = PlaceOptions()  # how the drive becomes a place
-    places: int = PLACES  # spots of the place that the policy tells apart; 0: none
+    places: int = PLACES  # place cells that the policy distinguishes; 0: none
     episodes: int = 50  # of each row of the evaluation, at most
     size: int | None = None  # without a checkpoint: side of the pictures [pixels]; None: 84
     envs: int = ENVIRONMENT[PRESET]['envs']  # robots that learn at a time
@@ -58,8 +58,8 @@ class TeachJob:
             (self.minutes > 0, 'there is some time to learn', self.minutes, 'raise --minutes'),
             (self.episodes >= 1, 'there is at least one episode', self.episodes,
              'raise --episodes'),
-            (self.places == 0 or 2 <= self.places <= 1024, 'there are 2 to 1024 spots, or none',
-             self.places, 'correct --places'),
+            (self.places == 0 or 2 <= self.places <= 1024,
+             'there are 2 to 1024 place cells, or none', self.places, 'correct --places'),
             (self.envs >= 1, 'there is at least one robot', self.envs, 'raise --envs'),
             (self.size is None or self.checkpoint is None, 'the size is that of the checkpoint',
              self.size, 'leave out --size'),

@@ -1,4 +1,4 @@
-"""The network that `teach` begins with, and the weights of its own opinion and of advice."""
+"""The network that `teach` begins with, and the weights of its own logits and of path advice."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from vn_nav.learning.presets import TrainConfig
 from vn_nav.policy.network import Policy
 from vn_nav.robot import RobotSpec
 
-# Of the logits: what that policy thinks, and what it is advised.
-OWN, ADVISED = 0.75, 0.9
+# Factors of the policy's own logits, and of those of path advice.
+OWN_LOGIT_SHARE, ADVICE_LOGIT_SHARE = 0.75, 0.9
 
 
 def network_for_place(config: TrainConfig, robot: RobotSpec, size: int, seed: int,
@@ -37,15 +37,20 @@ def network_for_place(config: TrainConfig, robot: RobotSpec, size: int, seed: in
 
 @torch.no_grad()
 def blend(network: Policy, own: float) -> None:
-    """Weigh what a policy thinks, which one that was taught before has weighed, and the advice."""
+    """Scale the logits of the policy and of path advice.
+
+    Args:
+        network: made for a place.
+        own: factor of its own logits; 1 for one that was taught before.
+    """
     assert network.routes is not None  # it was made for a place
-    for layer, share in ((network.actor, own), (network.routes.advise, ADVISED)):
+    for layer, share in ((network.actor, own), (network.routes.advise, ADVICE_LOGIT_SHARE)):
         for part in layer.parameters():
             part.mul_(share)
 
 
 def widened(given: dict[str, torch.Tensor], network: Policy) -> dict[str, torch.Tensor]:
-    """Weights of a policy, for one whose memory is told of places as well: not yet listened to."""
+    """Weights of a policy for one whose memory has places as inputs too: with weights of zero."""
     own = network.state_dict()
     for name, tensor in own.items():
         if name not in given or name.startswith(('places.', 'routes.')):  # of another place

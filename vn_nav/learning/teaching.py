@@ -22,15 +22,15 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.measurement import new_result
 from vn_nav.learning.pairs import PairSource
-from vn_nav.learning.places import BANK, BATCH, fit_places, fit_routes
+from vn_nav.learning.places import BATCH, MAX_START_PICTURES, fit_places, fit_routes
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
 from vn_nav.learning.taught_place import Place, Watched
 from vn_nav.learning.teach_evaluation import (
     DECODING,
     DRIVE_SPLITS,
-    LEAST,
-    SEED,
+    EVALUATION_SEED,
+    MIN_EPISODES,
     Evaluation,
     Plan,
     cost_of,
@@ -38,7 +38,7 @@ from vn_nav.learning.teach_evaluation import (
     rows_of,
 )
 from vn_nav.learning.teach_job import PRESET, SIZE, TeachJob, numbers
-from vn_nav.learning.teach_network import OWN, blend, network_for_place
+from vn_nav.learning.teach_network import OWN_LOGIT_SHARE, blend, network_for_place
 from vn_nav.learning.trainer import train
 from vn_nav.learning.training import CHECKPOINT, STATE
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
@@ -46,19 +46,20 @@ from vn_nav.policy.network import Policy
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_nav.scenes import parse_scene
 
-FOR_A_SPOT = 4  # pictures for each spot that the policy tells apart, at least
-# How the minutes are divided. Reading the bag takes what it takes, but no round of the search for
-# places seen again begins after this share of all. Of what is left then the evaluation gets this
-# share at most, and learning the rest:
-SEARCHED, EVALUATED = 0.25, 0.25
-RESERVED = 3.0  # s to write what was learned
-# of learning, shares for the spots and the ways between them: where that is all (a policy that
-# finds pictures anywhere needs no more), and before reinforcement from nothing.
-ALONE, FIRST = (0.4, 0.6), (0.07, 0.1)
-COUNTED = 1 / 3  # of the time for ways, at most, to count what actions lose
-LEAST_BANK, FOR_THE_BANK = 512, 30.0  # pictures that ways begin at; s below which there are fewer
-START = 'start'  # folder of the policy that knows the place, but no way there
-DECISIONS = ENVIRONMENT[PRESET]['max_decisions']
+MIN_PICTURES_PER_CELL = 4  # for each place cell that the policy distinguishes
+# Of all minutes: no round of the search for loop closures begins after this share. Reading the bag
+# takes the time that it needs.
+SEARCH_TIME_SHARE = 0.25
+EVALUATION_TIME_SHARE = 0.25  # of the minutes left after that, at most; learning gets the rest
+WRITE_TIME_S = 3.0  # to write what was learned
+# Of learning, for place cells and for paths: where there is nothing else to learn (a policy that
+# finds pictures anywhere needs no more), and before reinforcement learning from nothing.
+PLACE_TIME_SHARES_ALONE, PLACE_TIME_SHARES = (0.4, 0.6), (0.07, 0.1)
+REGRET_TIME_SHARE = 1 / 3  # of the time for paths, at most, to count what actions lose
+# Pictures that paths begin at when the time for paths is shorter than this.
+MIN_START_PICTURES, FULL_SEARCH_S = 512, 30.0
+START = 'start'  # folder of the policy that knows the place, but no path there
+MAX_DECISIONS = ENVIRONMENT[PRESET]['max_decisions']
 COLLISION_REWARD = -0.05  # of leaving what the pictures cover
 
 
@@ -92,7 +93,7 @@ def teach(job: TeachJob, place: Place) -> Path:
             size = given.config.size if given else job.size or SIZE
             graph = read_place(bag, job.options, place.build_graph, robot, size,
                                Path(job.cache or out / 'decoded'), stages,
-                               stages.at(SEARCHED))
+                               stages.at(SEARCH_TIME_SHARE))
             run = Teaching(job, place, graph, given, robot, stages)
             run.learn()
             run.evaluate()
@@ -150,19 +151,19 @@ class Teaching:
 
     def _divide(self) -> None:
         """Divide what is left of the minutes, and say how."""
-        read, left = self.stages.seconds, self.stages.left - RESERVED
+        read, left = self.stages.seconds, self.stages.left - WRITE_TIME_S
         config = self._config(left, left)
         network = self._network(config)
         network.compute_dtype = torch.float32  # as of a checkpoint that is loaded
         self.stages('what an evaluation costs', 0.0)
         most = min(self.job.episodes, evaluator.ENVIRONMENTS)
-        few = min(LEAST, most)
+        few = min(MIN_EPISODES, most)
         self.costs = [cost_of(functools.partial(self._env, self.own, stop=evaluator.ARRIVAL),
                               network, envs)
                       for envs in (few, max(most, few + 1))]
         splits = [name for name, graph in self._graphs().items() if graph is not None]
         self.rows = rows_of(splits, network, self.given.network if self.given else None)
-        self.evaluated = min(EVALUATED * max(left, 0.0), self._plan(math.inf).seconds)
+        self.evaluated = min(EVALUATION_TIME_SHARE * max(left, 0.0), self._plan(math.inf).seconds)
         self.learned = max(left - self.evaluated, 0.0)
         chosen = self._plan(self.evaluated)
         if left <= 0:
@@ -170,7 +171,7 @@ class Teaching:
                   f'{read / 60:.1f}; the least is learned and measured', flush=True)
         elif chosen.missing:
             print(f'{self.job.minutes:g} minutes are few: all {len(self.rows)} rows of the '
-                  f'evaluation, of {min(LEAST, self.job.episodes)} episodes each, may take '
+                  f'evaluation, of {min(MIN_EPISODES, self.job.episodes)} episodes each, may take '
                   f'{self._least() / 60:.1f}; the first {len(chosen.rows)} are measured',
                   flush=True)
         print(f'{self.job.minutes:g} minutes: reading the bag {read / 60:.1f}, learning '
@@ -182,7 +183,7 @@ class Teaching:
         job = self.job
         config = self._config(self.learned, self.learned)
         if job.places and self.given is not None:
-            self._learn_places(config, ALONE, self.folder)
+            self._learn_places(config, PLACE_TIME_SHARES_ALONE, self.folder)
             return
         world = ENVIRONMENT[PRESET] | {'collision_reward': COLLISION_REWARD}
         env = self._env(self.own, job.envs, seed=job.seed, privileged=config.privileged,
@@ -190,8 +191,8 @@ class Teaching:
         init = job.checkpoint
         if job.places and not (job.resume and (self.out / STATE).is_file()):
             init = self.out / START
-            self._learn_places(config, FIRST, init)
-        left = self.stages.left - RESERVED - self.evaluated
+            self._learn_places(config, PLACE_TIME_SHARES, init)
+        left = self.stages.left - WRITE_TIME_S - self.evaluated
         config = self._config(left, self.learned)
         self.stages('reinforcement', 0.0)
         self.stages.pause()  # a training has a bar of its own
@@ -207,13 +208,13 @@ class Teaching:
         # The checkpoint is written again with what is measured: its checksum is not final.
         info = {key: value for key, value in taught.info.items() if key != 'sha256'}
         result = new_result(info, checkpoint=str(self.folder), bag=self.bag.name,
-                            max_decisions=DECISIONS, decoding=DECODING, seed=SEED)
+                            max_decisions=MAX_DECISIONS, decoding=DECODING, seed=EVALUATION_SEED)
         graphs = {name: graph for name, graph in self._graphs().items() if graph is not None}
         self.evaluation = Evaluation(
             self.out, result, graphs,
             lambda graph, envs, stop: self._env(graph, envs, stop=stop), self.robot, threshold)
         try:
-            self.evaluation.run(self._plan(self.stages.left - RESERVED), taught.network,
+            self.evaluation.run(self._plan(self.stages.left - WRITE_TIME_S), taught.network,
                                 self.given.network if self.given else None, self.stages)
         finally:
             self.stages.pause()
@@ -224,7 +225,7 @@ class Teaching:
             save_checkpoint(self.folder, taught.network, info)
 
     def keep(self) -> str:
-        """Make sure of a checkpoint after an interruption; what there is, in words."""
+        """Make sure of a checkpoint after an interruption; returns a summary of it."""
         if self.evaluation is not None:
             count = sum(len(rows) for split in self.evaluation.result['splits'].values()
                         for rows in split['rows'].values())
@@ -247,19 +248,19 @@ class Teaching:
         return dict(zip(DRIVE_SPLITS, (self.own, self.others), strict=True))
 
     def _plan(self, seconds: float) -> Plan:
-        return plan(self.rows, self.costs, self.job.episodes, seconds, DECISIONS)
+        return plan(self.rows, self.costs, self.job.episodes, seconds, MAX_DECISIONS)
 
     def _least(self) -> float:
-        return plan(self.rows, self.costs, min(LEAST, self.job.episodes), math.inf,
-                    DECISIONS).seconds
+        return plan(self.rows, self.costs, min(MIN_EPISODES, self.job.episodes), math.inf,
+                    MAX_DECISIONS).seconds
 
     def _config(self, seconds: float, learned: float) -> TrainConfig:
         config = numbers(self.job, self.given, seconds / 60, learned / 60)
         return dataclasses.replace(
-            config, places=min(config.places, len(self.graph.poses) // FOR_A_SPOT))
+            config, places=min(config.places, len(self.graph.poses) // MIN_PICTURES_PER_CELL))
 
     def _env(self, graph: Any, envs: int, **options) -> Any:
-        options = {'max_decisions': DECISIONS} | options
+        options = {'max_decisions': MAX_DECISIONS} | options
         return self.place.make_env(graph, self.robot, envs, light=True, **options)
 
     def _pairs(self) -> tuple[PairSource, PairSource]:
@@ -287,7 +288,7 @@ class Teaching:
         if not self.advised:
             info['notes'] += ' Interrupted before any way was learned: it drives as it did before.'
         elif self.given is not None:
-            blend(network, own=1.0 if self.given.config.places else OWN)
+            blend(network, own=1.0 if self.given.config.places else OWN_LOGIT_SHARE)
         save_checkpoint(folder, network, {
             **info, 'frames': 0, 'seed': self.job.seed,
             'minutes': round((time.monotonic() - begun) / 60, 2),
@@ -304,9 +305,10 @@ class Teaching:
                             minutes=max(seconds, 1e-3) / 60, say=say, least=BATCH,
                             show=functools.partial(stages, 'learning the place'))
         left = end - time.monotonic()
-        pictures, poses = views.draw(BANK if left > FOR_THE_BANK else LEAST_BANK)
+        pictures, poses = views.draw(
+            MAX_START_PICTURES if left > FULL_SEARCH_S else MIN_START_PICTURES)
         regrets = self.place.regrets(
-            own, poses, time.monotonic() + COUNTED * left,
+            own, poses, time.monotonic() + REGRET_TIME_SHARE * left,
             functools.partial(stages, 'counting what actions lose'))
         if len(regrets) < len(own.goals):
             print(f'ways to {len(regrets)} of the {len(own.goals)} goals: for more there is no '

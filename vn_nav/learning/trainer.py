@@ -35,7 +35,7 @@ def train(env: NavigationVectorEnv, config: TrainConfig, folder: str | Path, *,
 
     Started by torchrun, several processes train one policy (`vn_nav.learning.distributed`):
     frames are those of all, the first one writes the files, and a process that died is replaced
-    as torchrun was told, all going on from the last save. Then episodes begin anew and replay
+    as torchrun was asked for, all going on from the last save. Then episodes begin anew and replay
     memories fill anew.
 
     Args:

@@ -36,11 +36,12 @@ from vn_nav.vector_env import GoalLabelsEnv, NavigationVectorEnv
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
-ACTOR = 500_009  # between the seeds of a learner and of its actor
-RANKS_APART, RESUMPTIONS_APART = 10_007, 1_000_003  # between the seeds of processes and lives
+ACTOR_SEED_STEP = 500_009  # between the seeds of a learner and of its actor
+RANK_SEED_STEP = 10_007  # between the seeds of processes
+RESUMPTION_SEED_STEP = 1_000_003  # between the seeds of a run and its resumptions
 COLUMNS = ('frames', 'minutes', 'fps', 'tau', 'success', 'return', 'length', 'collisions',
            *BASIC_LOSSES, 'collect_seconds', 'update_seconds', *TASKS)
-RECENT = 200  # episodes that the shown success, return, length and collisions are means over
+RECENT_EPISODES = 200  # that the shown success, return, length and collisions are means over
 
 
 class Training:
@@ -70,7 +71,8 @@ class Training:
         if bags is not None:
             bags.attach(self.network, processes.rank)
         self.learner = Learner(self.network, config, self.generator, replay=self._replay(size),
-                               processes=processes, beside=None if bags is None else bags.loss)
+                               processes=processes,
+                               auxiliary_loss=None if bags is None else bags.loss)
         # All processes see that a gradient is not finite, whosever batch it came from.
         self.learner.failed_batch = folder / (
             f'{processes.rank}-{FAILED_BATCH}' if processes.count > 1 else FAILED_BATCH)
@@ -89,7 +91,7 @@ class Training:
                 env.num_envs * processes.count, start=config.start_difficulty,
                 threshold=config.success_to_advance, step=config.difficulty_step,
                 window=config.advance_window)
-        self.recent: deque[Episode] = deque(maxlen=RECENT)
+        self.recent: deque[Episode] = deque(maxlen=RECENT_EPISODES)
         self.frames, self.updates, self.seconds = 0, 0, 0.0
         self.clock = time.monotonic()
 
@@ -123,7 +125,7 @@ class Training:
     def start(self, resume: bool, init: str | Path | None,
               pairs: Callable[[], tuple[PairSource, PairSource]] | None) -> None:
         """Go on from the last save, or begin; the arguments are those of `train`."""
-        state = self.processes.told(lambda: self._saved(resume))
+        state = self.processes.from_leader(lambda: self._saved(resume))
         if state is not None:
             restore(self, state)
             return
@@ -167,10 +169,11 @@ class Training:
 
     def begin(self, life: int = 0) -> None:
         """Start episodes and random numbers that no other process or life has seen."""
-        seed = (self.config.seed + RANKS_APART * self.processes.rank + RESUMPTIONS_APART * life)
+        seed = (self.config.seed + RANK_SEED_STEP * self.processes.rank
+                + RESUMPTION_SEED_STEP * life)
         self.generator.manual_seed(seed)
         if self.actor is not self.network:
-            self.drawn.manual_seed(seed + ACTOR)
+            self.drawn.manual_seed(seed + ACTOR_SEED_STEP)
             self.actor.load_state_dict(self.network.state_dict())
         self.env.set_difficulty(self.curriculum.tau)
         self.collector.begin(seed)

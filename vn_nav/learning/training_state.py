@@ -80,7 +80,7 @@ def restore(training: Training, state: dict) -> None:
                             'environment that recalls them', type(training.env).__name__,
                             'resume it where it began, or start a new one')
         training.env.recall_goals(state['shown goals'].numpy())
-    words = [f'resumed at {training.frames:,} frames']
+    notes = [f'resumed at {training.frames:,} frames']
     if state['env'] is not None and training.processes.count == 1:
         training.generator.set_state(state['generator'])
         if training.config.overlap and state.get('ahead'):
@@ -99,15 +99,15 @@ def restore(training: Training, state: dict) -> None:
         training.curriculum.load_state_dict({
             **state['curriculum'], 'first': [0] * count, 'finished': [False] * count})
         training.begin(training.updates)
-        words.append('episodes begin anew')
+        notes.append('episodes begin anew')
     replay = training.learner.replay
     if replay is not None:
         replay.load_state_dict(state.get('replay') or {'total': 0})
-        words.append(
+        notes.append(
             f'the replay memory is mapped: {replay.count * replay.num_envs:,} steps are there'
             if replay.resumed == 'mapped' else 'the replay memory is refilled from now on')
     if training.processes.leads:
-        print('; '.join(words), flush=True)
+        print('; '.join(notes), flush=True)
     training.clock = time.monotonic()
 
 

@@ -18,11 +18,12 @@ from vn_nav.policy.clock_watch import ClockWatch
 from vn_nav.policy.navigator import Navigator
 
 TOPIC = 'cmd_vel'
-PATIENCE = 0.5  # s without odometry after which lock-step sends a command unasked
-CROSSING = 0.03  # s of wall time, see _lock_step
+LOCK_STEP_SILENCE_S = 0.5  # without odometry, after which lock-step sends a command unasked
+CROSSING_S = 0.03  # of wall time, see _lock_step
 # Odometry that moves by this, and by more than the robot could have, was set anew.
 JUMP_M, JUMP_RAD = 0.1, 0.3
-DRIVABLE = 3.0  # times the robot's limits: they are conservative, and messages come in bursts
+# Times the robot's limits: they are conservative, and messages come in bursts.
+PLAUSIBLE_SPEED_FACTOR = 3.0
 REORDERED_S = 1.0  # odometry from longer ago is from another time
 
 
@@ -47,7 +48,7 @@ class CommandOutput:
 
     def __init__(self, node, navigator: Navigator, wake: threading.Condition, *, period: float,
                  lock_step: bool, stamped: bool, name: str = TOPIC,
-                 patience: float | None = PATIENCE):
+                 patience: float | None = LOCK_STEP_SILENCE_S):
         self._node, self._navigator, self._wake = node, navigator, wake
         self._period, self._in_lock_step = period, lock_step
         self._is_running: Callable[[], bool] = lambda: False
@@ -97,7 +98,7 @@ class CommandOutput:
             self._wake.notify_all()
 
     def _jump(self, values: np.ndarray, now: float, back: float) -> str:
-        """A step in the pose that no driving explains, in words; empty: there is none."""
+        """A step in the pose that no driving explains, as a reason; empty: there is none."""
         if self.odometry is None:
             return ''
         if back > 0.0:
@@ -105,9 +106,9 @@ class CommandOutput:
         robot, passed = self._navigator.robot, now - self._received
         step = math.hypot(*(values[:2] - self.odometry[:2]))
         turn = abs((values[2] - self.odometry[2] + math.pi) % (2 * math.pi) - math.pi)
-        if step > JUMP_M + DRIVABLE * robot.max_linear * passed:
+        if step > JUMP_M + PLAUSIBLE_SPEED_FACTOR * robot.max_linear * passed:
             return f'odometry jumped by {step:.4g} m'
-        if turn > JUMP_RAD + DRIVABLE * robot.max_angular * passed:
+        if turn > JUMP_RAD + PLAUSIBLE_SPEED_FACTOR * robot.max_angular * passed:
             return f'odometry jumped by {math.degrees(turn):.4g} deg'
         return ''
 
@@ -180,7 +181,7 @@ class CommandOutput:
                 self._wait_for_odometry(answered, or_decision=not moving,
                                         timeout=self._patience)
                 if first and self._rests and self._count > answered:
-                    self._wait_for_odometry(self._count, or_decision=False, timeout=CROSSING)
+                    self._wait_for_odometry(self._count, or_decision=False, timeout=CROSSING_S)
                 if not self._is_running():
                     return
                 if moving and self._count == answered and not self.odometry_lost:

@@ -22,7 +22,7 @@ from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 
-WINDOW_S = 5.0  # of which rates and latencies are told
+WINDOW_S = 5.0  # that rates and latencies are measured over
 
 
 class DecisionWorker:
@@ -34,7 +34,7 @@ class DecisionWorker:
         runtime: makes them; only the thread in `run` uses it.
         wake: guards the navigator and what this object keeps.
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
-        shadow: decide only where `tell` says so, for a robot that somebody else drives.
+        shadow: decide only after `note_executed`, for a robot that somebody else drives.
 
     Attributes:
         camera_fov: field of view of the camera [rad], as far as it is known.
@@ -47,7 +47,7 @@ class DecisionWorker:
         self._node, self._navigator, self._runtime = node, navigator, runtime
         self._wake, self._lock_step = wake, lock_step
         self._shadow = shadow
-        self._told: tuple[float, int] | None = None  # what `tell` was told
+        self._executed: tuple[float, int] | None = None  # stamp [s] and action
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
         self.camera_fov: float | None = None
         self._frame: tuple | None = None  # the newest message, its stamp, when it came
@@ -55,12 +55,12 @@ class DecisionWorker:
         self._goal_in_force: Image | None = None
         self._epoch = navigator.epoch
         self.inferences = Window(WINDOW_S)
-        self._said: bool | None = None  # on `arrived`
+        self._published: bool | None = None  # on `arrived`
         self._action, names, self._arrived = self.publishers = [
             node.create_publisher(kind, name, qos(name)) for kind, name in (
                 (Int8, 'action'), (String, 'action_names'), (Bool, 'arrived'))]
         names.publish(String(data=json.dumps(list(runtime.action_names))))
-        self.tell_arrival()
+        self.publish_arrival()
 
     def show_frame(self, message, stamp: float, received: float) -> None:
         """The newest admitted picture; one before it that still waits is dropped.
@@ -80,7 +80,7 @@ class DecisionWorker:
             self._goal = message
             self._wake.notify_all()
 
-    def tell(self, stamp: float, action: str | None) -> None:
+    def note_executed(self, stamp: float, action: str | None) -> None:
         """What the robot really did before the picture of a stamp, where a decision is wanted.
 
         Args:
@@ -92,7 +92,7 @@ class DecisionWorker:
         """
         number = -1 if action is None else self._runtime.action_names.index(action)
         with self._wake:
-            self._told = (stamp, number)
+            self._executed = (stamp, number)
             if self._frame is None and self._shown is not None and self._shown[1] >= stamp:
                 self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
@@ -122,7 +122,7 @@ class DecisionWorker:
         if self.camera_fov is not None:
             crop_fraction(self.camera_fov, self._runtime.camera_fov)
 
-    def tell_arrival(self, *, again: bool = False) -> None:
+    def publish_arrival(self, *, again: bool = False) -> None:
         """Publish whether the robot stands where the policy has arrived, when that changed.
 
         Args:
@@ -130,8 +130,8 @@ class DecisionWorker:
         """
         with self._wake:
             arrived = self._navigator.arrival is not None
-            if again or arrived != self._said:
-                self._said = arrived
+            if again or arrived != self._published:
+                self._published = arrived
                 self._arrived.publish(Bool(data=arrived))
 
     def run(self, is_running: Callable[[], bool]) -> None:
@@ -161,7 +161,7 @@ class DecisionWorker:
                 stamp = message.header.stamp
                 self._navigator.accept_goal(stamp.sec + stamp.nanosec * 1e-9 if self._lock_step
                                             else -math.inf)
-                self.tell_arrival(again=True)
+                self.publish_arrival(again=True)
 
     def _refuse_goal(self, why: str) -> None:
         self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
@@ -178,15 +178,15 @@ class DecisionWorker:
             if self._epoch != self._navigator.epoch:
                 self._epoch = self._navigator.epoch
                 self._runtime.reset()
-            told = self._told if self._shadow else None
-            if self._shadow and (told is None or stamp < told[0]):
+            executed = self._executed if self._shadow else None
+            if self._shadow and (executed is None or stamp < executed[0]):
                 return
             ticket = self._navigator.request(stamp, now)
             if ticket is None:
                 return
-            if told is not None:
-                self._runtime.correct(told[1])
-                self._told = None
+            if executed is not None:
+                self._runtime.correct(executed[1])
+                self._executed = None
         try:
             action = self._runtime.act(picture)
         except FloatingPointError as error:
@@ -199,10 +199,10 @@ class DecisionWorker:
             self.inferences.add(now, now - begun)
             if self._runtime.arrived:
                 self._navigator.declared(ticket, self._runtime.arrival, now)
-                self.tell_arrival()
+                self.publish_arrival()
             else:
-                # Still holding the lock: whoever hears of it finds it decided, and no command for
-                # it is out yet.
+                # Still holding the lock: a receiver of it finds it decided, and no command for it
+                # is out yet.
                 if self._navigator.decided(ticket, action, now):
                     self._action.publish(Int8(data=action))
             self._wake.notify_all()

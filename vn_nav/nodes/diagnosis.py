@@ -13,7 +13,7 @@ from vn_nav.nodes.qos import qos
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import State
 
-MOST_WARNINGS = 5
+MAX_WARNINGS = 5
 LEVELS = {State.STOPPED: DiagnosticStatus.ERROR, State.HOLD: DiagnosticStatus.WARN}
 
 
@@ -43,33 +43,33 @@ class Diagnosis:
             warnings: what is wrong though it may drive; the first is part of the message.
             fault: why the node is out of action, if it is.
         """
-        warnings = [shorten(warning) for warning in warnings[:MOST_WARNINGS]]
+        warnings = [shorten(warning) for warning in warnings[:MAX_WARNINGS]]
         # Rates in a warning change all the time: it is the same warning.
-        told = tuple(re.sub(r'[0-9.]+', '#', warning) for warning in warnings)
-        changed = self._last != (state, reason, fault, *told)
+        summaries = tuple(re.sub(r'[0-9.]+', '#', warning) for warning in warnings)
+        changed = self._last != (state, reason, fault, *summaries)
         if not changed and time.monotonic() - self._published < 0.95:
             return
         if changed and state is State.STOPPED:
             self.node.get_logger().error(f'stopped: {reason}; ~/reset, then ~/enable to go on')
-        for warning, short in zip(warnings, told, strict=True):
+        for warning, short in zip(warnings, summaries, strict=True):
             if self._last is None or short not in self._last:
                 self.node.get_logger().warning(warning, throttle_duration_sec=5.0)
-        self._last, self._published = (state, reason, fault, *told), time.monotonic()
-        level, words = LEVELS.get(state, DiagnosticStatus.OK), state.value
+        self._last, self._published = (state, reason, fault, *summaries), time.monotonic()
+        level, summary = LEVELS.get(state, DiagnosticStatus.OK), state.value
         if reason:
-            words += f' ({reason})' if state is State.ARRIVED else f': {reason}'
+            summary += f' ({reason})' if state is State.ARRIVED else f': {reason}'
         if warnings:
             level = max(level, DiagnosticStatus.WARN)
-            words += f'; {warnings[0]}'
+            summary += f'; {warnings[0]}'
         if fault:
-            level, words = DiagnosticStatus.ERROR, fault
+            level, summary = DiagnosticStatus.ERROR, fault
         if mismatch := self._mismatched_listeners():
-            level, words = DiagnosticStatus.ERROR, mismatch
+            level, summary = DiagnosticStatus.ERROR, mismatch
         values = {'state': state.value, 'reason': reason,
                   'listeners_on_cmd_vel': self.command.get_subscription_count(), **values}
         message = DiagnosticArray(status=[DiagnosticStatus(
             level=level, name=self.node.get_fully_qualified_name(), hardware_id=self.hardware,
-            message=words,
+            message=summary,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
         message.header.stamp = self.node.get_clock().now().to_msg()
         self.publisher.publish(message)

@@ -1,7 +1,7 @@
 """Parameters of all nodes: one table a node, from which they are declared, checked and explained.
 
 A table maps names to (default, meaning), or to (default, meaning, limits). Limits are (least,
-most) for numbers, in the parameter's unit, or the allowed words for text; None: none. The type of
+most) for numbers, in the parameter's unit, or the allowed values for text; None: none. The type of
 the default is the type of the parameter.
 """
 
@@ -61,7 +61,7 @@ def check(name: str, table: Mapping[str, tuple], value: object) -> None:
         return
     if isinstance(default, str):
         if value not in limits:
-            raise UserError(f'{name} is one of {_words(limits)}', value, remedy)
+            raise UserError(f'{name} is one of {_listed(limits)}', value, remedy)
     elif not limits[0] <= value <= limits[1]:
         raise UserError(f'{name} lies between {limits[0]} and {limits[1]}', value, remedy)
 
@@ -71,11 +71,11 @@ def help_lines(table: Mapping[str, tuple]) -> list[str]:
     lines = []
     for name, entry in table.items():
         default, meaning, limits = entry[0], entry[1], _limits(entry)
-        shown = _words(default) if isinstance(default, list) else (
+        shown = _listed(default) if isinstance(default, list) else (
             str(default).lower() if isinstance(default, bool) else default)
         span = ''
         if limits is not None:
-            span = f'; {_words(limits)}' if isinstance(default, str) else (
+            span = f'; {_listed(limits)}' if isinstance(default, str) else (
                 f'; {limits[0]} to {limits[1]}')
         lines.append(f'  {name} ({"empty" if shown == "" else shown}{span}): {meaning}')
     return lines
@@ -85,8 +85,8 @@ def _limits(entry: tuple) -> Sequence | None:
     return entry[2] if len(entry) > 2 else None
 
 
-def _words(words: Sequence[str]) -> str:
-    return ', '.join(word or '(empty)' for word in words)
+def _listed(values: Sequence[str]) -> str:
+    return ', '.join(value or '(empty)' for value in values)
 
 
 def _fits(value: object, default: object) -> bool:
@@ -102,7 +102,7 @@ def _descriptor(entry: tuple, read_only: bool) -> ParameterDescriptor:
     if limits is None:
         return descriptor
     if isinstance(default, str):
-        descriptor.additional_constraints = f'one of {_words(limits)}'
+        descriptor.additional_constraints = f'one of {_listed(limits)}'
     else:
         kind, slot = ((IntegerRange, descriptor.integer_range) if isinstance(default, int) else
                       (FloatingPointRange, descriptor.floating_point_range))
@@ -113,7 +113,7 @@ def _descriptor(entry: tuple, read_only: bool) -> ParameterDescriptor:
 def _name_unknown(node: Node, given: Collection[str], others: Collection[str]) -> None:
     unknown = sorted(name for name in given if not node.has_parameter(name))
     for name in unknown:
-        if any(f':{word}'.partition(':=')[0].endswith(f':{name}') for word in sys.argv[1:]):
+        if any(f':{given}'.partition(':=')[0].endswith(f':{name}') for given in sys.argv[1:]):
             near = difflib.get_close_matches(name, node._parameters, 1)
             raise UserError(f'a parameter is one that {node.get_name()} has', name,
                             f'did you mean {near[0]}?' if near else 'see --help')

@@ -21,7 +21,7 @@ from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import ENABLED, Navigator
 
-CAMERA_FOV = (math.radians(5), math.radians(170))  # what a pinhole camera can have
+CAMERA_FOV_RAD = (math.radians(5), math.radians(170))  # what a pinhole camera can have
 
 
 class PolicyInputs:
@@ -35,7 +35,7 @@ class PolicyInputs:
         wake: guards the navigator.
         compressed: pictures come on image_raw/compressed.
         lock_step: stamps are the simulator's ticks, and nothing is late.
-        shadow: somebody else drives, and says what he did.
+        shadow: somebody else drives, and publishes what was done.
 
     Attributes:
         subscriptions: what was made.
@@ -52,16 +52,16 @@ class PolicyInputs:
         self.subscriptions: list = []
         image, kind = (('image_raw/compressed', CompressedImage) if compressed else
                        ('image_raw', Image))
-        self._hear(image, kind, self._on_image)
-        self._hear('camera_info', CameraInfo, self._on_camera_info)
-        self._hear('goal_image', Image, self._on_goal)
+        self._subscribe(image, kind, self._on_image)
+        self._subscribe('camera_info', CameraInfo, self._on_camera_info)
+        self._subscribe('goal_image', Image, self._on_goal)
         # In lock-step no message may be missed, and the simulator is reliable.
-        self.odometry_topic = self._hear('odom', Odometry, self._on_odometry, exact=lock_step)
+        self.odometry_topic = self._subscribe('odom', Odometry, self._on_odometry, exact=lock_step)
         if shadow:
-            self._hear('executed_action', String, self._on_executed_action, exact=True)
+            self._subscribe('executed_action', String, self._on_executed_action, exact=True)
 
-    def _hear(self, name: str, kind: type, callback, *, exact: bool = False) -> str:
-        """Subscribe, as the contract says or so that any publisher is heard; the resolved name."""
+    def _subscribe(self, name: str, kind: type, callback, *, exact: bool = False) -> str:
+        """Subscribe, as the contract says or from any publisher; the resolved name."""
         self.subscriptions += (
             [self._node.create_subscription(kind, name, callback, qos(name))] if exact
             else subscribe(self._node, kind, name, callback))
@@ -105,9 +105,9 @@ class PolicyInputs:
 
     def _on_executed_action(self, message: String) -> None:
         try:
-            told = json.loads(message.data)
-            sec, nanosec = told['stamp']
-            self._worker.tell(sec + nanosec * 1e-9, told['action'])
+            executed = json.loads(message.data)
+            sec, nanosec = executed['stamp']
+            self._worker.note_executed(sec + nanosec * 1e-9, executed['action'])
         except Exception as error:  # whatever somebody writes there
             self._node.get_logger().error(
                 "executed_action is JSON with stamp [sec, nanosec] and an action's name or null; "
@@ -118,17 +118,17 @@ class PolicyInputs:
         if side <= 0 or focal == 0:
             return  # an uncalibrated camera says zero
         fov = field_of_view(side, side, focal)
-        if not CAMERA_FOV[0] <= fov <= CAMERA_FOV[1]:
-            least, most = map(math.degrees, CAMERA_FOV)
+        if not CAMERA_FOV_RAD[0] <= fov <= CAMERA_FOV_RAD[1]:
+            least, most = map(math.degrees, CAMERA_FOV_RAD)
             self._node.get_logger().error(
                 f'a camera sees {least:.0f} to {most:.0f} deg; camera_info says '
                 f'{math.degrees(fov):.3g}: calibrate the camera', throttle_duration_sec=10.0)
             return
         self._worker.set_camera_fov(fov)
 
-    # What there is to say of them.
+    # What is missing or wrong with them.
 
-    def unheard(self) -> list[str]:
+    def unreceived(self) -> list[str]:
         """Topics that are published and not received: another type, or no odometry."""
         found = [f'{node} publishes {name} as {other}, and this node subscribes to '
                  f'{kind.__name__}: remap it, or republish it'
@@ -142,7 +142,7 @@ class PolicyInputs:
 
     def warnings(self) -> list[str]:
         """What is wrong with the inputs though the robot may drive."""
-        warnings = self.unheard()
+        warnings = self.unreceived()
         if goals := self._goals.warning(time.monotonic()):
             warnings.append(goals)
         if (self._output.odometry is None and not self._lock_step and not warnings

@@ -9,7 +9,6 @@ Run: `ros2 run vn_nav policy_node --ros-args -p checkpoint:=models/house`.
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 import threading
@@ -19,26 +18,24 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
-from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.errors import UserError
 from vn_nav.nodes import policy_parameters
-from vn_nav.nodes.command_output import PATIENCE, TOPIC, CommandOutput
+from vn_nav.nodes.command_output import LOCK_STEP_SILENCE_S, TOPIC, CommandOutput
 from vn_nav.nodes.decision_worker import DecisionWorker
-from vn_nav.nodes.diagnosis import Diagnosis
 from vn_nav.nodes.policy_inputs import PolicyInputs
+from vn_nav.nodes.policy_operation import Operation
 from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.work_threads import WorkThreads
 from vn_nav.policy.frame_gate import shorten
-from vn_nav.policy.navigator import ENABLED, Limits, Navigator, State
+from vn_nav.policy.navigator import Limits, Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec, load_robot
 
-LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step
-SHADOW_LIMIT = 30.0  # s, the same in a shadow: nothing moves, and a busy machine may take its time
-WARNINGS_PERIOD = 0.9  # s: to look at the graph takes a while
-WORKER_PATIENCE = 5.0  # s that a decision under way is waited for when the node ends
+# The watchdog's limits in a shadow: nothing moves, and a busy machine may take its time.
+SHADOW_LIMIT_S = 30.0
+DECISION_END_TIMEOUT_S = 5.0  # for a decision under way when the node ends
 
 
 class PolicyNode(LifecycleNode):
@@ -106,7 +103,7 @@ class PolicyNode(LifecycleNode):
         robot = robot.with_actions(runtime.action_names, runtime.moves)
         shadow = value['mode'] == 'shadow'
         if self.lock_step:
-            limit = SHADOW_LIMIT if shadow else LOCK_STEP_LIMIT
+            limit = SHADOW_LIMIT_S if shadow else policy_parameters.LOCK_STEP_LIMIT_S
             limits = Limits(frame_timeout=limit, frame_stop_timeout=limit,
                             inference_timeout=limit, odometry_timeout=limit, settle_time=0.0)
         else:
@@ -117,33 +114,31 @@ class PolicyNode(LifecycleNode):
             self, self.navigator, self._wake, period=1.0 / value['control_rate'],
             lock_step=self.lock_step, stamped=value['enable_stamped_cmd_vel'],
             # In a shadow nothing waits for commands: each answers odometry or a decision.
-            name=f'shadow/{TOPIC}' if shadow else TOPIC, patience=None if shadow else PATIENCE)
+            name=f'shadow/{TOPIC}' if shadow else TOPIC,
+            patience=None if shadow else LOCK_STEP_SILENCE_S)
         self._worker = DecisionWorker(self, self.navigator, runtime, self._wake,
                                       lock_step=self.lock_step, shadow=shadow)
         self._require_odometry = value['require_odometry']
-        self._warnings: list[str] = []
-        self._warned_at = 0.0  # steady time [s]
         self._inputs = PolicyInputs(self, self.navigator, self._worker, self._output, self._wake,
                                     compressed=value['image_transport'] == 'compressed',
                                     lock_step=self.lock_step, shadow=shadow)
         self._make_interfaces()
 
     def _make_interfaces(self) -> None:
-        self._diagnosis = Diagnosis(self, self._output.publisher, self.navigator.robot.name)
+        self._operation = Operation(
+            self, self.navigator, self._worker, self._output, self._inputs, self._wake,
+            self._steady, lock_step=self.lock_step, auto_enable=self.auto_enable,
+            require_odometry=self._require_odometry)
         self._interfaces = [
             *((self.destroy_subscription, subscription)
               for subscription in self._inputs.subscriptions),
-            (self.destroy_service, self.create_service(SetBool, '~/enable', self._on_enable)),
-            (self.destroy_service, self.create_service(Trigger, '~/stop', self._on_stop)),
-            (self.destroy_service, self.create_service(Trigger, '~/reset', self._on_reset)),
-            (self.destroy_timer, self.create_timer(0.25, self._on_timer, clock=self._steady)),
             *((self.destroy_publisher, publisher) for publisher in (
-                self._output.publisher, *self._worker.publishers, self._diagnosis.publisher)),
+                self._output.publisher, *self._worker.publishers)),
         ]
 
     def on_activate(self, state) -> TransitionCallbackReturn:
         """Start looking; motion needs ~/enable."""
-        others = self._other_publishers()
+        others = self._operation.other_publishers()
         if others:
             self._fail(UserError(
                 'this node alone publishes its command topic', f'{others} more publisher(s) on '
@@ -174,8 +169,8 @@ class PolicyNode(LifecycleNode):
         ended = self.halt('deactivated')
         with self._wake:
             self.navigator.reset()
-            self._worker.tell_arrival()
-        self._diagnose()
+            self._worker.publish_arrival()
+        self._operation.diagnose()
         done = super().on_deactivate(state)
         return done if ended else TransitionCallbackReturn.ERROR
 
@@ -198,6 +193,8 @@ class PolicyNode(LifecycleNode):
 
     def _let_go(self) -> None:
         interfaces, self._interfaces = self._interfaces, []
+        if interfaces:
+            self._operation.end()
         for destroy, interface in interfaces:
             destroy(interface)
 
@@ -220,7 +217,7 @@ class PolicyNode(LifecycleNode):
         """End both threads. The zero comes first: a decision under way is not waited for.
 
         Returns:
-            True; False when the decision under way did not end within `WORKER_PATIENCE`.
+            True; False when the decision under way did not end within `DECISION_END_TIMEOUT_S`.
         """
         with self._wake:
             threads = self._threads
@@ -231,9 +228,9 @@ class PolicyNode(LifecycleNode):
             self._wake.notify_all()
         threads.join('output')  # it waits for nothing but `wake`
         self._output.deliver_zero()  # the output thread is gone: still only one owner
-        ended = threads.join('inference', WORKER_PATIENCE)
+        ended = threads.join('inference', DECISION_END_TIMEOUT_S)
         if not ended:
-            self.get_logger().error(f'a decision did not end within {WORKER_PATIENCE:g} s')
+            self.get_logger().error(f'a decision did not end within {DECISION_END_TIMEOUT_S:g} s')
         return ended
 
     def _on_failed_thread(self, threads: WorkThreads, name: str, error: Exception) -> None:
@@ -252,102 +249,6 @@ class PolicyNode(LifecycleNode):
         if self.broken and self.is_running:
             self.get_logger().error(f'{self.broken}; going inactive: activate it again')
             self.trigger_deactivate()
-
-    # Services.
-
-    def _on_enable(self, request, response):
-        with self._wake:
-            if request.data:
-                response.success, response.message = self._enable()
-            else:
-                self.navigator.disable()
-                response.success, response.message = True, 'disabled'
-            self._worker.tell_arrival()
-            self._wake.notify_all()
-        self._diagnose()
-        return response
-
-    def _enable(self) -> tuple[bool, str]:
-        blockers = []
-        if not self.is_running:
-            blockers.append('the node is not active: activate it first'
-                            + (f' (it went inactive: {self.broken})' if self.broken else ''))
-        if not self.has_clock():
-            blockers.append('use_sim_time is set and nothing has come on /clock: start the '
-                            'simulator, or set use_sim_time to false')
-        blockers += self._inputs.unheard()
-        if self._output.odometry is None:
-            if self.lock_step:
-                blockers.append('no odometry: lock_step answers each message on odom')
-            elif self._require_odometry:
-                blockers.append(f'no odometry has come on {self._inputs.odometry_topic} '
-                                '(require_odometry is set)')
-        elif self._output.odometry_lost:
-            blockers.append(f'odometry is silent: check {self._inputs.odometry_topic}')
-        if others := self._other_publishers():
-            blockers.append(f'{others} other publisher(s) on cmd_vel: remap one')
-        try:
-            self._worker.check_fov()
-        except UserError as error:
-            blockers.append(str(error))
-        return self.navigator.enable(time.monotonic(), tuple(blockers))
-
-    def _on_stop(self, _request, response):
-        with self._wake:
-            self.navigator.stop('~/stop was called', time.monotonic())
-            self._worker.tell_arrival()
-            self._wake.notify_all()
-        response.success, response.message = True, 'stopped: ~/reset, then ~/enable to go on'
-        return response
-
-    def _on_reset(self, _request, response):
-        with self._wake:
-            self.navigator.reset()
-            self._worker.tell_arrival()
-            self._wake.notify_all()
-        response.success, response.message = True, 'ready: ~/enable to go on'
-        return response
-
-    def _on_timer(self) -> None:
-        """Four times a second: intruders on the command topic, self-enabling, diagnostics."""
-        with self._wake:
-            if self.is_running:
-                others = self._other_publishers()
-                if others and self.navigator.state in ENABLED:
-                    self.navigator.stop(f'{others} other publisher(s) on cmd_vel',
-                                        time.monotonic())
-                elif self.auto_enable and self.navigator.state is State.IDLE:
-                    self._enable()
-                self._worker.tell_arrival()
-                self._wake.notify_all()
-        self._diagnose()
-
-    def _other_publishers(self) -> int:
-        return max(0, self.count_publishers(self._output.publisher.topic_name) - 1)
-
-    def _diagnose(self) -> None:
-        """Publish the state once a second, and at once when it changes."""
-        if not self._interfaces:
-            return
-        if time.monotonic() - self._warned_at > WARNINGS_PERIOD:
-            self._warned_at = time.monotonic()
-            self._warnings = self._inputs.warnings()
-            if self.get_parameter('use_sim_time').value and (
-                    self.count_publishers(self.resolve_topic_name('/clock')) > 1):
-                self._warnings.append('/clock has several publishers: time will jump; keep one')
-        with self._wake:
-            state, reason = self.navigator.state, self.navigator.reason
-            if state is State.IDLE and not self.is_running:
-                reason = 'the node is not active'
-            fov, gate = self._worker.camera_fov, self.navigator.gate
-            values = {'decisions': self.navigator.decisions, **self._worker.filter_values(),
-                      **self._inputs.values(),
-                      'camera_fov_deg': round(math.degrees(fov), 1) if fov else 'unknown',
-                      **{f'dropped: {kind}': n for kind, n in gate.dropped.items()},
-                      **({'last_dropped': gate.last} if gate.last else {}),
-                      **({'broken': self.broken} if self.broken else {})}
-        self._diagnosis.publish(state, reason, values, self._warnings,
-                                fault=f'inactive: {self.broken}' if self.broken else '')
 
 
 def drive(node: PolicyNode, ended: Ended) -> None:

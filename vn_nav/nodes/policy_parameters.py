@@ -7,6 +7,9 @@ from collections.abc import Iterable
 from vn_nav.errors import UserError
 from vn_nav.nodes import parameters
 
+# The watchdog's limits in lock-step, of wall time.
+LOCK_STEP_LIMIT_S = 2.0
+
 # name: (default, meaning, limits or None), as in `vn_nav.nodes.parameters`.
 PARAMETERS = {
     'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),

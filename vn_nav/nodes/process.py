@@ -28,7 +28,7 @@ from vn_nav.nodes.signals import Ended
 
 __all__ = ['Ended', 'compiling', 'run_node', 'spin']
 
-# What ROS says of words that it refuses, while it starts or makes a node.
+# What ROS raises for arguments that it refuses, while it starts or makes a node.
 _ros: Any = rclpy._rclpy_pybind11  # type: ignore[attr-defined]  # compiled, without types
 REFUSED = (NameValidationException, ParameterException,
            _ros.RCLError, _ros.RCLInvalidROSArgsError, _ros.UnknownROSArgsError)
@@ -40,7 +40,7 @@ USAGE = """usage: ros2 run vn_nav {name} [--ros-args [-p name:=value] [--params-
 
 parameters (default; limits):
 {lines}"""
-REMEDIES = {  # by the word in front of what is refused
+REMEDIES = {  # by the text in front of what is refused
     '--params-file': 'give a params file that exists, as config/policy.yaml is one',
     '--log-level': 'the levels are debug, info, warn, error and fatal',
     'parameter override': 'write -p name:=value',
@@ -64,8 +64,8 @@ def run_node(name: str, make: Callable[[Ended], AnyNode],
     Returns:
         0; or 2 after a `UserError`, or arguments that ROS refuses, in one line on standard error.
     """
-    words = sys.argv[1:] if args is None else list(args)
-    if {'-h', '--help'} & set(itertools.takewhile(lambda word: word != '--ros-args', words)):
+    arguments = sys.argv[1:] if args is None else list(args)
+    if {'-h', '--help'} & set(itertools.takewhile(lambda part: part != '--ros-args', arguments)):
         print(USAGE.format(name=name, about=about.strip(),
                            lines='\n'.join(help_lines(parameters or {}))))
         return 0
@@ -73,13 +73,13 @@ def run_node(name: str, make: Callable[[Ended], AnyNode],
     try:
         with _refusals():
             with _silent():
-                own = remove_ros_args([name, *words])[1:]
+                own = remove_ros_args([name, *arguments])[1:]
                 if own:
                     raise UserError('arguments of a node stand after --ros-args', ' '.join(own),
                                     'see --help')
                 remove_dead_segments()
                 # rclpy's own handlers would close the context before the last message is out.
-                rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+                rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
             node = make(ended)
         work(node, ended)
     except UserError as error:
@@ -106,7 +106,7 @@ def spin(node: Node, ended: Ended) -> None:
 
 
 @contextlib.contextmanager
-def compiling(node: Node, ended: Ended, words: str, period: float = 5.0) -> Iterator[None]:
+def compiling(node: Node, ended: Ended, work: str, period: float = 5.0) -> Iterator[None]:
     """Slow work before a node can do anything: every few seconds it says that it goes on.
 
     A signal ends the process at once, with exit code 0.
@@ -115,7 +115,7 @@ def compiling(node: Node, ended: Ended, words: str, period: float = 5.0) -> Iter
 
     def say():
         while not done.wait(period):
-            node.get_logger().info(f'{words}: {time.monotonic() - begun:.0f} s so far')
+            node.get_logger().info(f'{work}: {time.monotonic() - begun:.0f} s so far')
 
     def let_go():
         Node.destroy_node(node)
@@ -129,7 +129,7 @@ def compiling(node: Node, ended: Ended, words: str, period: float = 5.0) -> Iter
         done.set()
         thread.join()
     if (seconds := time.monotonic() - begun) >= period:
-        node.get_logger().info(f'{words}: done after {seconds:.0f} s')
+        node.get_logger().info(f'{work}: done after {seconds:.0f} s')
 
 
 @contextlib.contextmanager
@@ -139,10 +139,10 @@ def _refusals() -> Iterator[None]:
         yield
     except REFUSED as error:
         # "Failed to parse ROS arguments: Couldn't ..., at /some/file.c:1": without its places.
-        said = ' '.join(re.sub(r', at /\S+:\d+', '', str(error)).split())
-        said = said.removeprefix('Failed to parse ROS arguments: ')
-        remedy = next((remedy for word, remedy in REMEDIES.items() if word in said), 'see --help')
-        raise UserError('arguments follow the ROS syntax', said, remedy) from error
+        message = ' '.join(re.sub(r', at /\S+:\d+', '', str(error)).split())
+        message = message.removeprefix('Failed to parse ROS arguments: ')
+        remedy = next((own for text, own in REMEDIES.items() if text in message), 'see --help')
+        raise UserError('arguments follow the ROS syntax', message, remedy) from error
 
 
 @contextlib.contextmanager

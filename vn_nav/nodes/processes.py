@@ -34,14 +34,14 @@ class Processes:
     def start(self, name: str, module: str, parameters: dict, rules: tuple[str, ...] = ()
               ) -> None:
         """Start a node of this package with parameters and remapping rules."""
-        words = [sys.executable, '-m', module, '--ros-args']
+        command = [sys.executable, '-m', module, '--ros-args']
         for key, value in parameters.items():
-            words += ['-p', f'{key}:={json.dumps(value)}']
+            command += ['-p', f'{key}:={json.dumps(value)}']
         for rule in rules:
-            words += ['-r', rule]
+            command += ['-r', rule]
         log = open(self.logs / f'{name}.log', 'w')
         self.running[name] = subprocess.Popen(
-            words, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
             env=self.environment, start_new_session=True)
         log.close()
 

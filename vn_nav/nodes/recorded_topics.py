@@ -1,4 +1,4 @@
-"""Topics that a training hears and says, each message recorded as everybody else hears it."""
+"""Topics that a training subscribes to and publishes; each message is recorded as it was sent."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class RecordedTopics:
         self._node = node
         self._writer = BagWriter(bag) if bag is not None else None
 
-    def hear(self, kind: type, name: str, handle: Callable[[Any], None], *,
-             history: bool = True, anybody: bool = False) -> None:
+    def subscribe(self, kind: type, name: str, handle: Callable[[Any], None], *,
+                  history: bool = True, anybody: bool = False) -> None:
         """Subscribe to a topic of the contract.
 
         Args:
             kind: of the messages.
             name: of the topic.
             handle: called with each.
-            history: also what was said before, where the topic keeps it.
-            anybody: hear any publisher, whatever its quality of service.
+            history: also what was published before, where the topic keeps it.
+            anybody: receive from any publisher, whatever its quality of service.
         """
         entry = topic(name)
         record = self.recording(name)
@@ -55,11 +55,11 @@ class RecordedTopics:
             record(message, info)
             handle(message)
         # rclpy also calls with what it knows of a message; its annotations have it without.
-        heard: Callable[..., None] = callback
+        receive: Callable[..., None] = callback
         if anybody:
-            subscribe(self._node, kind, name, heard)
+            subscribe(self._node, kind, name, receive)
         else:
-            self._node.create_subscription(kind, name, heard, profile(
+            self._node.create_subscription(kind, name, receive, profile(
                 entry if history else dataclasses.replace(entry, durability=VOLATILE)))
 
     def recording(self, name: str) -> Callable[..., None]:
@@ -80,7 +80,7 @@ class RecordedTopics:
             self._writer = None
             self._node.get_logger().error(f'recording stopped: {error}')
 
-    def say(self, publisher, name: str, message: Any) -> None:
+    def publish(self, publisher, name: str, message: Any) -> None:
         """Publish, and record it."""
         publisher.publish(message)
         if self._writer is not None:
@@ -88,7 +88,7 @@ class RecordedTopics:
         self._record(name, message)
 
     def record_own(self, publisher, name: str) -> None:
-        """Record what the node itself publishes, as everybody hears it."""
+        """Record what the node itself publishes, as everybody receives it."""
         if self._writer is None:
             return
         kind = publisher.msg_type

@@ -7,27 +7,23 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import importlib
-import importlib.util
 import operator
 import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.subscription import Subscription
 
-from vn_msgs_py.topics import BEST_EFFORT, LATCHED, TOPICS, VOLATILE, Topic, topic
-from vn_nav.bags.storage.definitions import definition
-from vn_nav.bags.storage.losses import Losses
+from vn_msgs_py.topics import LATCHED, TOPICS, Topic, topic
 from vn_nav.bags.storage.writer import MIN_FREE_BYTES, BagWriter, RecordingStopped
 from vn_nav.errors import UserError
 from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import profile, qos
+from vn_nav.nodes.taps import Tap, hidden, in_bag, installed, message_class, weakened
 
-QUEUE_DEPTH = 256  # messages a topic: pictures are best effort, and a recorder must not drop them
+# Messages of a topic: pictures are best effort, and a recorder must not drop them.
+QUEUE_DEPTH = 256
 MESSAGES_PER_TURN = 16  # messages of a topic that are taken before its neighbours have their turn
 POLL_PERIOD_S = 0.005  # s between looks at the subscriptions when there was nothing
 GRAPH_PERIOD_S = 0.2  # s between looks at who publishes
@@ -37,16 +33,11 @@ TWIN = {'geometry_msgs/msg/Twist': 'geometry_msgs/msg/TwistStamped'}  # accepted
 COMPRESSED = 'image_raw/compressed'  # a bag needs a picture once: only where there is no raw one
 
 
-def _installed(kind: str) -> bool:
-    """Whether a type's message package is there (tf2_msgs is in no wheel)."""
-    return importlib.util.find_spec(kind.partition('/')[0]) is not None
-
-
 # name: (default, meaning, limits), as in `vn_nav.nodes.parameters`.
 PARAMETERS = {
     'output': ('', 'folder of the bag; it must not exist; empty: rosbag2_ and the date'),
     'topics': ([entry.name for entry in TOPICS
-                if _installed(entry.type) and entry.name != COMPRESSED],
+                if installed(entry.type) and entry.name != COMPRESSED],
                'topics to record: names of the contract, or name:type; left as it is: also '
                f'{COMPRESSED} where no raw pictures are published'),
     'all': (False, 'record all other published topics as well'),
@@ -59,23 +50,8 @@ PARAMETERS = {
 }
 
 
-@dataclasses.dataclass
-class Tap:
-    """A topic that is listened to."""
-
-    topic: Topic  # as it is subscribed to, and named in the bag
-    name: str  # resolved
-    message: type
-    subscription: Subscription
-    losses: Losses = dataclasses.field(default_factory=Losses)
-    publishers: int = 1
-    received: int = 0
-    lost: int = 0
-    numbered: bool = True  # the middleware says the publishers' numbers
-
-
 class RecorderNode(Node):
-    """Writes what it hears, as it was serialised. It ends at a signal only: a robot drives on."""
+    """Writes messages as they were serialised. It ends at a signal only: a robot drives on."""
 
     def __init__(self):
         super().__init__('recorder_node')
@@ -89,15 +65,15 @@ class RecorderNode(Node):
         self.refused: set[str] = set()  # resolved names
         entries = [entry for entry in map(self._wanted, value['topics']) if entry is not None]
         for entry in entries:
-            _message(entry.type)
+            message_class(entry.type)
         self.writer = BagWriter(output, max_bytes=value['max_bag_size'],
                                 max_seconds=value['max_bag_duration'],
                                 min_free=value['min_free_space'])
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics',
                                                  qos('/diagnostics'))
         self.stopped = False
-        self.said: set[str] = set()  # what is said once
-        self.heard: set[str] = set()  # nodes that publish what is recorded
+        self.warned: set[str] = set()  # what is logged once
+        self.known_publishers: set[str] = set()  # nodes that publish what is recorded
         self.lost_said = 0
         self.look_at = self.report_at = time.monotonic()
         self.taps: dict[str, Tap] = {}  # by resolved name
@@ -113,23 +89,23 @@ class RecorderNode(Node):
         Taken straight from the subscriptions: an executor wakes up once a message, which a
         simulator in lock-step outruns, and what then overflows is lost.
         """
-        heard = []
+        taken_messages = []
         for tap in self.taps.values():
             handle = tap.subscription.handle
             with handle:
                 for _ in range(MESSAGES_PER_TURN):
                     if (taken := handle.take_message(tap.message, True)) is None:
                         break
-                    heard.append((self._note(tap, taken[1]), tap, taken))
+                    taken_messages.append((self._note(tap, taken[1]), tap, taken))
         # By the publisher's time: topics are taken in turn, which would put them out of order.
-        heard.sort(key=operator.itemgetter(0))
+        taken_messages.sort(key=operator.itemgetter(0))
         try:
-            for stamp, tap, (data, info) in heard:
+            for stamp, tap, (data, info) in taken_messages:
                 self.writer.write(tap.topic.name, data, stamp,
                                   info.get('publication_sequence_number') or 0)
         except RecordingStopped as error:
             self._stop(error)
-        return bool(heard)
+        return bool(taken_messages)
 
     def tend(self) -> None:
         """Look for publishers, and say what was lost, each when it is due."""
@@ -150,34 +126,34 @@ class RecorderNode(Node):
         written = self.writer.written
         for tap in self.taps.values():
             if tap.received or tap.lost:
-                kept = written[_in_bag(tap.topic.name)]
+                kept = written[in_bag(tap.topic.name)]
                 lost = f'{tap.lost} lost' if tap.numbered else 'lost: unknown'
-                self.get_logger().info(f'{_in_bag(tap.topic.name)}: {tap.received} received, '
+                self.get_logger().info(f'{in_bag(tap.topic.name)}: {tap.received} received, '
                                        f'{kept} written, {lost}')
         self.get_logger().info(f'{written.total()} messages recorded')
         super().destroy_node()
 
-    def _wanted(self, word: str) -> Topic | None:
+    def _wanted(self, entry: str) -> Topic | None:
         """What an entry of the parameter `topics` asks for; None: something to wait for."""
-        name, _, kind = word.partition(':')
+        name, _, kind = entry.partition(':')
         if kind.count('/') == 1:
             kind = kind.replace('/', '/msg/')
         try:
-            entry = topic(name)
-            return dataclasses.replace(entry, type=kind) if kind else entry
+            known = topic(name)
+            return dataclasses.replace(known, type=kind) if kind else known
         except KeyError as error:
             if not kind:
                 raise UserError('recorded topics are of the contract, or name:type',
                                 error.args[0], 'choose from vn_msgs_py.topics, or say for '
                                 'instance /scan:sensor_msgs/msg/LaserScan') from error
-        _message(kind)
+        message_class(kind)
         self.awaited[self.resolve_topic_name(name)] = kind
         return None
 
     def _listen(self, entry: Topic) -> None:
         """Subscribe to a topic and have it written."""
         self.writer.add(entry)
-        message = _message(entry.type)
+        message = message_class(entry.type)
         subscription = self.create_subscription(
             message, entry.name, lambda _: None,
             profile(entry, depth=max(QUEUE_DEPTH, entry.depth)), raw=True)
@@ -194,7 +170,7 @@ class RecorderNode(Node):
         if number is None:
             tap.numbered = False
         else:
-            tap.lost += tap.losses.hear(number, tap.publishers)
+            tap.lost += tap.losses.add(number, tap.publishers)
         return info['source_timestamp'] or info['received_timestamp'] or time.time_ns()
 
     def _look(self) -> None:
@@ -207,7 +183,7 @@ class RecorderNode(Node):
             self._listen(topic(COMPRESSED))
         if self.everything:
             for name, kinds in self.get_topic_names_and_types():
-                if not (name in self.taps or name in self.refused or _hidden(name)):
+                if not (name in self.taps or name in self.refused or hidden(name)):
                     self.awaited.setdefault(name, kinds[0])
         for name, kind in list(self.awaited.items()):
             offers = self._offers(name)
@@ -218,9 +194,9 @@ class RecorderNode(Node):
                 continue
             del self.awaited[name]
             try:
-                if any(_in_bag(tap.topic.name) == name for tap in self.taps.values()):
+                if any(in_bag(tap.topic.name) == name for tap in self.taps.values()):
                     raise UserError('a bag has one topic of a name', name, 'record it elsewhere')
-                self._listen(_weakened(Topic(name, kind, '', '', durability=LATCHED), offers))
+                self._listen(weakened(Topic(name, kind, '', '', durability=LATCHED), offers))
             except UserError as error:
                 self.refused.add(name)
                 self.get_logger().warning(f'{name} is not recorded: {error}')
@@ -230,9 +206,9 @@ class RecorderNode(Node):
         offers = self._offers(tap.name)
         mine = [offer for offer in offers if offer.topic_type == tap.topic.type]
         for name in sorted({f'{offer.node_namespace.rstrip("/")}/{offer.node_name}'
-                            for offer in mine} - self.heard):
-            self.heard.add(name)
-            self.get_logger().info(f'hears {name}')
+                            for offer in mine} - self.known_publishers):
+            self.known_publishers.add(name)
+            self.get_logger().info(f'receives from {name}')
         tap.publishers = max(len(mine), 1)
         entry = tap.topic
         if foreign := sorted({offer.topic_type for offer in offers} - {entry.type}):
@@ -242,7 +218,7 @@ class RecorderNode(Node):
             else:
                 self._warn_once(f'{tap.name} is also published as {", ".join(foreign)}: only '
                                 f'{entry.type} is recorded')
-        entry = _weakened(entry, mine)
+        entry = weakened(entry, mine)
         if entry != tap.topic:
             self.get_logger().info(f'{tap.name} is published as {entry.type}, {entry.reliability}'
                                    f', {entry.durability}: subscribing to that')
@@ -264,11 +240,11 @@ class RecorderNode(Node):
             return
         lost = sum(tap.lost for tap in self.taps.values())
         if lost > self.lost_said:
-            words = ', '.join(f'{_in_bag(tap.topic.name)} {tap.lost} of {tap.lost + tap.received}'
-                              for tap in self.taps.values() if tap.lost)
+            counts = ', '.join(f'{in_bag(tap.topic.name)} {tap.lost} of {tap.lost + tap.received}'
+                               for tap in self.taps.values() if tap.lost)
             self.get_logger().warning(f'{lost - self.lost_said} messages lost in the last second; '
-                                      f'so far {words}')
-            self._diagnose(DiagnosticStatus.WARN, f'messages lost so far: {words}')
+                                      f'so far {counts}')
+            self._diagnose(DiagnosticStatus.WARN, f'messages lost so far: {counts}')
         else:
             self._diagnose(DiagnosticStatus.OK, 'recording')
         self.lost_said = lost
@@ -283,50 +259,18 @@ class RecorderNode(Node):
             self.destroy_subscription(tap.subscription)
         self._diagnose(DiagnosticStatus.ERROR, f'recording stopped: {self.writer.stopped}')
 
-    def _diagnose(self, level: bytes, words: str) -> None:
+    def _diagnose(self, level: bytes, summary: str) -> None:
         message = DiagnosticArray(status=[DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(), message=words,
+            level=level, name=self.get_fully_qualified_name(), message=summary,
             values=[KeyValue(key=f'{RECEIVED}{tap.topic.name}', value=str(tap.received))
                     for tap in self.taps.values() if tap.received])])
         message.header.stamp = self.get_clock().now().to_msg()
         self.diagnostics.publish(message)
 
-    def _warn_once(self, words: str) -> None:
-        if words not in self.said:
-            self.said.add(words)
-            self.get_logger().warning(words)
-
-
-def _message(kind: str) -> type:
-    """The class of a type that is installed and whose definition is known.
-
-    Raises:
-        UserError: it is not.
-    """
-    definition(kind)
-    package, _, name = kind.partition('/msg/')
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError) as error:
-        raise UserError('a recorded type is of a message package that is installed', kind,
-                        'install or source its package, or leave the topic out') from error
-
-
-def _weakened(entry: Topic, offers: list) -> Topic:
-    """The topic with the strongest QoS, not above its own, that every publisher satisfies."""
-    weak = any(offer.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for offer in offers)
-    fleeting = any(offer.qos_profile.durability == DurabilityPolicy.VOLATILE for offer in offers)
-    return dataclasses.replace(
-        entry, reliability=BEST_EFFORT if weak else entry.reliability,
-        durability=VOLATILE if fleeting else entry.durability)
-
-
-def _in_bag(name: str) -> str:
-    return name if name.startswith('/') else f'/{name}'
-
-
-def _hidden(name: str) -> bool:
-    return any(part.startswith('_') for part in name.split('/'))
+    def _warn_once(self, warning: str) -> None:
+        if warning not in self.warned:
+            self.warned.add(warning)
+            self.get_logger().warning(warning)
 
 
 def record(node: RecorderNode, ended: Ended) -> None:

@@ -29,31 +29,31 @@ from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import Navigator
 from vn_nav.robot import RobotSpec
 
-# Beside the picture, by the key of `info`: topic and decoder.
-BESIDE = {'depth': ('depth/image_raw', images.decode_depth),
-          'segmentation': ('labels/image_raw', images.decode_labels)}
+# What comes with a picture, by the key of `info`: topic and decoder.
+MAP_TOPICS = {'depth': ('depth/image_raw', images.decode_depth),
+              'segmentation': ('labels/image_raw', images.decode_labels)}
 
 
 class Seen(NamedTuple):
     """What the robot sees at rest."""
 
     picture: np.ndarray  # [3,S,S] uint8
-    beside: dict[str, np.ndarray]  # [S,S] depth [m], 0 where unknown; segmentation class ids
+    maps: dict[str, np.ndarray]  # [S,S] depth [m], 0 where unknown; segmentation class ids
 
 
 @dataclasses.dataclass
 class Tally:
-    """What was said on topics since the last decision."""
+    """What came on topics since the last decision."""
 
     reward: float = 0.0
-    judged: bool = False  # somebody said something on `reward`
+    judged: bool = False  # something came on `reward`
     collided: bool = False
     arrived: bool = False
     end: int = 0
 
 
 class Senses:
-    """Subscriptions of one robot; callbacks keep the newest of each, and count what was said.
+    """Subscriptions of one robot; callbacks keep the newest of each, and count what came.
 
     Args:
         node: that subscribes.
@@ -69,10 +69,10 @@ class Senses:
     Attributes:
         goal: the goal picture in force [3,S,S]; None: none yet.
         goals: number of goals that were taken.
-        scene: what a simulator says of itself; empty: nobody does.
-        camera_fov: of the pictures [rad]; None: nobody has said.
+        scene: what a simulator publishes of itself; empty: none does.
+        camera_fov: of the pictures [rad]; None: unknown.
         frame: stamp [s] and picture, the newest of the present goal.
-        tally: what was said since the last decision.
+        tally: what came since the last decision.
     """
 
     def __init__(self, node: Node, topics: RecordedTopics, navigator: Navigator,
@@ -81,7 +81,7 @@ class Senses:
         self._node, self._topics, self._navigator, self._wake = node, topics, navigator, wake
         self._robot, self._size, self._lock_step = robot, size, lock_step
         self._goal_watch = GoalWatch(trust_stamps=lock_step)
-        self._beside: dict[str, collections.deque] = {}  # (stamp, message) by key
+        self._maps: dict[str, collections.deque] = {}  # (stamp, message) by key
         self.goal: np.ndarray | None = None
         self.goals = 0
         self.scene: dict = {}
@@ -90,32 +90,32 @@ class Senses:
         self.tally = Tally()
         # Outcomes come first: of what has arrived, the executor serves the oldest subscription
         # first, and so the outcome of a decision before the picture that follows it.
-        topics.hear(Float32, 'reward', self._on_reward, history=False)
-        topics.hear(Bool, 'collision', self._on_collision, history=False)
-        topics.hear(Bool, 'arrived', self._on_arrived, history=False)
-        topics.hear(UInt8, 'episode_end', self._on_episode_end, history=False)
-        topics.hear(String, 'scene', self._on_scene)
-        topics.hear(Image, 'goal_image', self._on_goal, anybody=True)
+        topics.subscribe(Float32, 'reward', self._on_reward, history=False)
+        topics.subscribe(Bool, 'collision', self._on_collision, history=False)
+        topics.subscribe(Bool, 'arrived', self._on_arrived, history=False)
+        topics.subscribe(UInt8, 'episode_end', self._on_episode_end, history=False)
+        topics.subscribe(String, 'scene', self._on_scene)
+        topics.subscribe(Image, 'goal_image', self._on_goal, anybody=True)
         # In lock-step no odometry may be missed, and the simulator is reliable.
-        topics.hear(Odometry, 'odom', output.take_odometry, anybody=not lock_step)
-        topics.hear(CameraInfo, 'camera_info', self._on_camera_info)
-        topics.hear(*((CompressedImage, 'image_raw/compressed') if compressed else
-                      (Image, 'image_raw')), self._on_image)
+        topics.subscribe(Odometry, 'odom', output.take_odometry, anybody=not lock_step)
+        topics.subscribe(CameraInfo, 'camera_info', self._on_camera_info)
+        topics.subscribe(*((CompressedImage, 'image_raw/compressed') if compressed else
+                           (Image, 'image_raw')), self._on_image)
 
     def listen(self, keys: tuple[str, ...]) -> None:
-        """Have these keys of `BESIDE` beside every picture."""
+        """Have the maps of these keys of `MAP_TOPICS` with every picture."""
         for key in keys:
-            self._beside[key] = collections.deque(maxlen=16)
+            self._maps[key] = collections.deque(maxlen=16)
 
-            def keep(message, rows=self._beside[key]) -> None:
+            def keep(message, rows=self._maps[key]) -> None:
                 with self._wake:
                     rows.append((_seconds(message.header.stamp), message))
                     self._wake.notify_all()
-            self._topics.hear(Image, BESIDE[key][0], keep)
+            self._topics.subscribe(Image, MAP_TOPICS[key][0], keep)
 
     def offers(self) -> set[str]:
-        """The keys of `BESIDE` that somebody publishes."""
-        return {key for key, (name, _) in BESIDE.items() if self._node.count_publishers(name)}
+        """The keys of `MAP_TOPICS` that somebody publishes."""
+        return {key for key, (name, _) in MAP_TOPICS.items() if self._node.count_publishers(name)}
 
     # Callbacks, on the executor's thread.
 
@@ -180,11 +180,11 @@ class Senses:
 
     def _on_scene(self, message: String) -> None:
         try:
-            said = json.loads(message.data)
+            scene = json.loads(message.data)
         except ValueError:  # another kind of scene
             return
-        if isinstance(said, dict):
-            self.scene = said
+        if isinstance(scene, dict):
+            self.scene = scene
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         side, focal = min(message.width, message.height), message.k[0]
@@ -192,19 +192,19 @@ class Senses:
             self.camera_fov = field_of_view(side, side, focal)
 
     def sees(self) -> bool:
-        """Whether there is a picture to decide on, and what belongs beside it."""
+        """Whether there is a picture to decide on, and what belongs to it."""
         return (self.frame is not None and self._navigator.wants(self.frame[0])
-                and all(_nearest(rows, self.frame[0]) for rows in self._beside.values()))
+                and all(_nearest(rows, self.frame[0]) for rows in self._maps.values()))
 
     def look(self) -> Seen:
-        """The newest picture, and what belongs beside it."""
+        """The newest picture, and what belongs to it."""
         assert self.frame is not None  # `sees` said so
         stamp, picture = self.frame
-        beside = {}
-        for key, rows in self._beside.items():
-            decoded = BESIDE[key][1](_nearest(rows, stamp))
-            beside[key] = np.nan_to_num(preprocess_map(decoded, self._size, **self._lens()))
-        return Seen(picture, beside)
+        maps = {}
+        for key, rows in self._maps.items():
+            decoded = MAP_TOPICS[key][1](_nearest(rows, stamp))
+            maps[key] = np.nan_to_num(preprocess_map(decoded, self._size, **self._lens()))
+        return Seen(picture, maps)
 
     def _prepare(self, message) -> np.ndarray:
         lens = self._lens()

@@ -21,14 +21,14 @@ from rclpy.signals import SignalHandlerOptions
 from vn_nav.bags.drive import RECORDED
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.nodes.process import Ended
-from vn_nav.nodes.robot_senses import BESIDE, Seen
+from vn_nav.nodes.robot_senses import MAP_TOPICS, Seen
 from vn_nav.nodes.ros_robot import RosRobot
 from vn_nav.reset_arguments import read_options
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import HOUSE, house_scene
 
 ROBOT = 'robot'  # in place of the name of a simulator
-GOALS = 1024  # different goal pictures of a training
+MAX_GOALS = 1024  # different goal pictures of a training
 
 
 class RosEnv:
@@ -71,7 +71,7 @@ class RosEnv:
                  ros_arguments: Sequence[str] = ()):
         self.robot, self.num_envs = robot, len(namespaces)
         self.action_names = robot.action_names
-        self.goals = np.zeros((GOALS, 3, size, size), np.uint8)
+        self.goals = np.zeros((MAX_GOALS, 3, size, size), np.uint8)
         self._numbers: dict[bytes, int] = {}  # of goals, by their bytes
         self.privileged: tuple[str, ...] = ()
         self._collision_reward = collision_reward
@@ -98,20 +98,21 @@ class RosEnv:
         self.offers = tuple(sorted(present | (set() if lock_step else {'arrived'})))
 
     def _start(self, namespaces: Sequence[str], arguments: Sequence[str], record: Path | None,
-               options: dict) -> None:
-        words = ['--ros-args', *arguments] if arguments else []
+               settings: dict) -> None:
+        options = ['--ros-args', *arguments] if arguments else []
         try:
             # rclpy's own handlers would close the context before the last zero is out.
-            rclpy.init(args=words, context=self._context,
+            rclpy.init(args=options, context=self._context,
                        signal_handler_options=SignalHandlerOptions.NO)
             self._executor = SingleThreadedExecutor(context=self._context)
             for name in namespaces:
                 bag = record if record is None or len(namespaces) == 1 else record / name
-                self._robots.append(RosRobot(self._context, name, bag=bag, **options))
+                self._robots.append(RosRobot(self._context, name, bag=bag, **settings))
                 self._executor.add_node(self._robots[-1])
-        except (RuntimeError, ValueError, ParameterException) as error:  # of words that it refuses
-            raise UserError('namespaces and --ros-args follow the ROS syntax',
-                            ' '.join([*namespaces, *words]), str(error).splitlines()[0]) from error
+        except (RuntimeError, ValueError, ParameterException) as error:  # refused options
+            raise UserError(
+                'namespaces and --ros-args follow the ROS syntax',
+                ' '.join([*namespaces, *options]), str(error).splitlines()[0]) from error
         self._thread = threading.Thread(target=self._spin, name='executor', daemon=True)
         self._thread.start()
         for one in self._robots:
@@ -149,9 +150,9 @@ class RosEnv:
 
         Bridges of earlier versions simulated houses alone, and did not say so.
         """
-        said = {one.scene.get('simulator', HOUSE if 'house' in one.scene else ROBOT)
-                for one in self._robots}
-        return said.pop() if len(said) == 1 else ROBOT
+        names = {one.scene.get('simulator', HOUSE if 'house' in one.scene else ROBOT)
+                 for one in self._robots}
+        return names.pop() if len(names) == 1 else ROBOT
 
     @property
     def scene_names(self) -> list[str]:
@@ -182,7 +183,7 @@ class RosEnv:
         """Have these of `offers` in `info`."""
         self.privileged = tuple(privileged)
         for one in self._robots:
-            one.listen(tuple(key for key in privileged if key in BESIDE))
+            one.listen(tuple(key for key in privileged if key in MAP_TOPICS))
 
     def set_difficulty(self, tau: float) -> None:
         """Do nothing: where a robot starts is not for its policy's trainer to say."""
@@ -199,7 +200,7 @@ class RosEnv:
         seen = [self._begin(n) for n in range(self.num_envs)]
         none = np.zeros(self.num_envs, bool)
         self._done[:] = False
-        return self._observe(seen), self._tell(seen, ~none, none, none, none)
+        return self._observe(seen), self._info(seen, ~none, none, none, none)
 
     def step(self, actions):
         """One decision of every robot whose episode goes on; the others begin the next one."""
@@ -226,7 +227,7 @@ class RosEnv:
         self.steps += int((~reset).sum())
         self.seconds += time.monotonic() - begun
         return (self._observe(seen), reward, terminated, truncated,
-                self._tell(seen, reset, success, collided, arrived))
+                self._info(seen, reset, success, collided, arrived))
 
     def _begin(self, k: int) -> Seen:
         seen, goal = self._robots[k].begin(), self._robots[k].goal
@@ -238,8 +239,8 @@ class RosEnv:
     def _number(self, picture: np.ndarray) -> int:
         """Place of a goal picture in the table."""
         number = self._numbers.setdefault(picture.tobytes(), len(self._numbers))
-        if number == GOALS:
-            raise EnvironmentLost(f'a training has at most {GOALS} different goal pictures',
+        if number == MAX_GOALS:
+            raise EnvironmentLost(f'a training has at most {MAX_GOALS} different goal pictures',
                                   'one more', 'go on with a new training: --init')
         self.goals[number] = picture
         return number
@@ -249,11 +250,11 @@ class RosEnv:
                 'goal_index': self._goal_index.copy(), 'last_action': self._last_action.copy(),
                 'last_reward': self._last_reward.copy()}
 
-    def _tell(self, seen: list[Seen], reset, success, collided, arrived) -> dict[str, np.ndarray]:
-        told = {key: np.stack([one.beside[key] for one in seen]) for key in self.privileged
-                if key in BESIDE}
+    def _info(self, seen: list[Seen], reset, success, collided, arrived) -> dict[str, np.ndarray]:
+        maps = {key: np.stack([one.maps[key] for one in seen]) for key in self.privileged
+                if key in MAP_TOPICS}
         return {'reset': reset, 'success': success, 'collided': collided, 'arrived': arrived,
-                **told}
+                **maps}
 
     def _spin(self) -> None:
         """Serve all robots; a callback that fails stops them."""

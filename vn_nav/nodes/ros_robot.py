@@ -11,12 +11,10 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Twist, TwistStamped
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
@@ -24,28 +22,26 @@ from rclpy.node import Node
 from std_msgs.msg import Int8, String
 from std_srvs.srv import Trigger
 
-from vn_nav.errors import EnvironmentLost, UserError
+from vn_nav.errors import UserError
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.recorded_topics import RecordedTopics
+from vn_nav.nodes.robot_readiness import Readiness
 from vn_nav.nodes.robot_senses import Seen, Senses, Tally
 from vn_nav.nodes.work_threads import WorkThreads
 from vn_nav.observation import crop_fraction
-from vn_nav.policy.navigator import ENABLED, STOP_SECONDS, Limits, Navigator, State
+from vn_nav.policy.navigator import ENABLED, Limits, Navigator
 from vn_nav.robot import RobotSpec
 
 NAME = 'training_node'
 PARAMETERS = ('image_transport', 'enable_stamped_cmd_vel', 'control_rate', 'frame_timeout',
               'frame_stop_timeout', 'max_frame_age', 'max_frame_ahead', 'odometry_timeout',
               'settle_time')
-PATIENCE = 120.0  # s, default of the parameter `patience`
-LOCK_STEP_LIMIT = 2.0  # s of wall time: the watchdog's limits in lock-step, as in policy_node
-VERDICT = 2.0  # s that the end of a decision in lock-step waits for its judge
-LOOK = 0.05  # s between looks for a signal
-QUIET = 1.0  # s of waiting about which nothing is said
-WATCH = 0.25  # s between looks for other publishers
+PATIENCE_S = 120.0  # default of the parameter `patience`
+JUDGE_TIMEOUT_S = 2.0  # that the end of a decision in lock-step waits for its judge
+GRAPH_PERIOD_S = 0.25  # between looks for other publishers
 TERMINATED, TRUNCATED = 1, 2  # on `episode_end`
 
 
@@ -80,15 +76,15 @@ class RosRobot(Node):
                  lock_step: bool, max_decisions: int, ended: Ended, bag: Path | None):
         super().__init__(NAME, namespace=namespace or None, context=context)
         policy_parameters.declare(self, PARAMETERS, others=None)
-        self.patience = self.declare_parameter('patience', PATIENCE, ParameterDescriptor(
+        patience = self.declare_parameter('patience', PATIENCE_S, ParameterDescriptor(
             description='without a picture, a goal or leave to move a training ends after [s]',
             floating_point_range=[FloatingPointRange(from_value=1.0, to_value=1e6)])).value
         value = policy_parameters.read(self, PARAMETERS)
         self.robot, self.size, self.lock_step = robot, size, lock_step
-        self.max_decisions, self.ended = max_decisions, ended
+        self.max_decisions = max_decisions
         self.wake = threading.Condition()  # guards everything below, and wakes all threads
-        limits = (Limits(LOCK_STEP_LIMIT, LOCK_STEP_LIMIT, odometry_timeout=LOCK_STEP_LIMIT,
-                         settle_time=0.0) if lock_step else
+        limit = policy_parameters.LOCK_STEP_LIMIT_S
+        limits = (Limits(limit, limit, odometry_timeout=limit, settle_time=0.0) if lock_step else
                   Limits(**{name: value[name] for name in Limits.__dataclass_fields__
                             if name in value}))
         self.navigator = Navigator(robot, limits, exact=lock_step)
@@ -99,31 +95,32 @@ class RosRobot(Node):
         self._senses = Senses(
             self, self._topics, self.navigator, self.output, self.wake, robot, size,
             lock_step=lock_step, compressed=value['image_transport'] == 'compressed')
-        self.failure: str = ''  # of a thread
-        self._held = False
         self._threads: WorkThreads | None = None
         self._shown: Seen | None = None
         self._episode_goal = 0  # number of the goal that the episode began with
         self._awaits_goal = False
         self._decisions = self._cut_before = 0
-        self._stopped_since: float | None = None
+        self._readiness = Readiness(self, self.navigator, self.output, self.wake, ended, patience,
+                                    lambda: self._running)
         self._make_interfaces()
 
     def _make_interfaces(self) -> None:
         self._action, names = (self.create_publisher(kind, name, qos(name)) for kind, name in (
             (Int8, 'action'), (String, 'action_names')))
-        self._topics.say(names, 'action_names', String(data=json.dumps(self.robot.action_names)))
+        self._topics.publish(names, 'action_names',
+                             String(data=json.dumps(self.robot.action_names)))
         self._topics.record_own(self.output.publisher, 'cmd_vel')
         self.create_service(Trigger, '~/stop', self._on_stop)
         self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_timer(WATCH, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(GRAPH_PERIOD_S, self._watch,
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def listen(self, keys: tuple[str, ...]) -> None:
-        """Have these keys of `BESIDE` beside every picture."""
+        """Have the maps of these keys of `MAP_TOPICS` with every picture."""
         self._senses.listen(keys)
 
     def offers(self) -> set[str]:
-        """The keys of `BESIDE` that somebody publishes."""
+        """The keys of `MAP_TOPICS` that somebody publishes."""
         return self._senses.offers()
 
     @property
@@ -138,7 +135,7 @@ class RosRobot(Node):
 
     def _on_stop(self, _request, response):
         with self.wake:
-            self._held = True
+            self._readiness.held = True
             self.navigator.stop('~/stop was called', time.monotonic())
             self.wake.notify_all()
         response.success, response.message = True, 'stopped: ~/reset to go on'
@@ -146,13 +143,13 @@ class RosRobot(Node):
 
     def _on_reset(self, _request, response):
         with self.wake:
-            self._held = False
+            self._readiness.held = False
         response.success, response.message = True, 'the training goes on'
         return response
 
     def _watch(self) -> None:
         """Four times a second: intruders on the command topic."""
-        if others := self._other_publishers():
+        if others := self._readiness.other_publishers():
             with self.wake:
                 if self.navigator.state in ENABLED:
                     self.navigator.stop(f'{others} other publisher(s) on cmd_vel',
@@ -168,11 +165,12 @@ class RosRobot(Node):
             UserError: one of them is missing, another node publishes commands, or the camera sees
                 less than the robot's.
         """
-        if others := self._other_publishers():
+        if others := self._readiness.other_publishers():
             raise UserError('this node alone publishes its command topic', f'{others} more '
                             f'publisher(s) on {self.output.publisher.topic_name}',
                             'end the other node, or remap one of them')
-        self._until(lambda: not self._missing(), lambda: f'waits for {", ".join(self._missing())}')
+        self._readiness.wait_until(lambda: not self._missing(),
+                                   lambda: f'waits for {", ".join(self._missing())}')
         if self._senses.camera_fov is not None:
             crop_fraction(self._senses.camera_fov, self.robot.camera_fov)
         self._threads = WorkThreads({'output': self.output.run}, self._on_failed_thread).start()
@@ -181,18 +179,17 @@ class RosRobot(Node):
         found = (('image_raw', self._senses.frame is not None),
                  ('odom', self.output.odometry is not None),
                  ('goal_image', self.goal is not None),
-                 (f'somebody {self._listener_words()}', self._listeners()),
+                 (f'somebody {self._readiness.listener_kind()}', self._readiness.listeners()),
                  ('scene', self.scene or not self.count_publishers('scene')))
         return [name for name, there in found if not there]
 
     def begin(self) -> Seen:
         """Begin an episode: what the robot sees, once there is a goal and it may move."""
-        def ready() -> bool:
-            if self._awaits_goal and self._senses.goals == self._episode_goal:
-                return False
-            return self._senses.sees()
-        self._until(ready, lambda: 'waits for the next picture on goal_image'
-                    if self._awaits_goal and self._senses.goals == self._episode_goal else '')
+        def lacks_goal() -> bool:
+            return self._awaits_goal and self._senses.goals == self._episode_goal
+        self._readiness.wait_until(
+            lambda: not lacks_goal() and self._senses.sees(),
+            lambda: 'waits for the next picture on goal_image' if lacks_goal() else '')
         with self.wake:
             self._senses.tally = Tally()
             self._episode_goal, self._awaits_goal, self._decisions = self._senses.goals, False, 0
@@ -209,11 +206,11 @@ class RosRobot(Node):
             self.navigator.decided(ticket, action, now)
             self._cut_before = self.navigator.cut_off
             return True
-        self._until(taken)
+        self._readiness.wait_until(taken)
         with self.wake:
             self.wake.notify_all()
         self._decisions += 1
-        self._topics.say(self._action, 'action', Int8(data=action))
+        self._topics.publish(self._action, 'action', Int8(data=action))
 
     def finish(self) -> Outcome:
         """Wait until the motion is over and seen: what came of it."""
@@ -227,21 +224,21 @@ class RosRobot(Node):
             # In lock-step a judge speaks before the picture; one that lost its word is not
             # waited for.
             return (not self.lock_step or self._senses.tally.judged
-                    or time.monotonic() - at_rest > VERDICT)
-        self._until(over)
+                    or time.monotonic() - at_rest > JUDGE_TIMEOUT_S)
+        self._readiness.wait_until(over)
         with self.wake:
-            said, self._senses.tally = self._senses.tally, Tally()
+            tally, self._senses.tally = self._senses.tally, Tally()
             elsewhere = self._senses.goals != self._episode_goal
             cut = self.navigator.cut_off != self._cut_before
             seen = self._shown if elsewhere else self._senses.look()
         assert seen is not None  # the decision was made at a picture
-        success = said.reward > 0 or said.arrived
-        terminated = success or said.end == TERMINATED
+        success = tally.reward > 0 or tally.arrived
+        terminated = success or tally.end == TERMINATED
         limit = self._decisions >= self.max_decisions and not self.count_publishers('episode_end')
-        truncated = not terminated and (said.end == TRUNCATED or elsewhere or cut or limit)
-        self._awaits_goal = terminated or said.end == TRUNCATED
+        truncated = not terminated and (tally.end == TRUNCATED or elsewhere or cut or limit)
+        self._awaits_goal = terminated or tally.end == TRUNCATED
         self._shown = seen
-        return Outcome(seen, said.reward or float(said.arrived), success, said.collided,
+        return Outcome(seen, tally.reward or float(tally.arrived), success, tally.collided,
                        terminated, truncated, stale=elsewhere)
 
     def halt(self) -> None:
@@ -257,100 +254,9 @@ class RosRobot(Node):
             self.output.deliver_zero()  # the output thread is gone: still only one owner
         self._topics.close()
 
-    def fail(self, words: str) -> None:
+    def fail(self, reason: str) -> None:
         """Something broke that nobody expected: zero, and no more training."""
-        with self.wake:
-            self.failure = self.failure or words
-            self.navigator.stop(words, time.monotonic())
-            self.wake.notify_all()
-
-    # Waiting.
-
-    def _until(self, ready: Callable[[], bool], words: Callable[[], str] = lambda: '') -> None:
-        """Wait until something holds, and on the way go on from what stopped by itself.
-
-        Args:
-            ready: called with `wake` held.
-            words: what is waited for, where it is nothing that stopped the robot.
-
-        Raises:
-            EnvironmentLost: a signal, a failure, or `patience` is over.
-        """
-        begun, said = time.monotonic(), ''
-        with self.wake:
-            while True:
-                now = time.monotonic()
-                self._check(now)
-                if ready():
-                    break
-                why = words() or self._go_on(now)
-                if now - begun > self.patience:
-                    self.navigator.stop('the training has no more patience', now)
-                    raise EnvironmentLost(
-                        f'a robot is ready again within {self.patience:g} s (parameter patience)',
-                        f'{self._who()}{why or "no picture after the motion"}',
-                        'see to it, and resume the training: what was learned is saved')
-                if now - begun > QUIET and why and why != said:
-                    said = why
-                    print(f'{self._who()}paused: {why}', flush=True)
-                self.wake.wait(LOOK)
-        if said:
-            print(f'{self._who()}goes on after {time.monotonic() - begun:.1f} s', flush=True)
-
-    def _check(self, now: float) -> None:
-        if self.ended.is_set():
-            self.navigator.stop('a signal', now)
-            self.wake.notify_all()
-            raise EnvironmentLost('a training goes on until a signal', 'one', 'resume it')
-        if self.failure:
-            raise EnvironmentLost('the threads of a robot work', f'{self._who()}{self.failure}',
-                                  'resume the training: what was learned is saved')
-
-    def _go_on(self, now: float) -> str:
-        """Enable motion again as soon as nothing is in the way; what is, in words."""
-        navigator = self.navigator
-        if navigator.state is State.STOPPED:
-            self._stopped_since = self._stopped_since or now
-            if now - self._stopped_since < STOP_SECONDS or self._blockers():  # zero is repeated
-                return navigator.reason
-            navigator.reset()
-        self._stopped_since = None
-        if navigator.state is State.IDLE:
-            enabled, words = navigator.enable(now, self._blockers())
-            return '' if enabled else words
-        return navigator.reason
-
-    def _blockers(self) -> tuple[str, ...]:
-        if not self._running:
-            return ()
-        rules = (
-            (self._held, '~/stop was called: call ~/reset'),
-            (self._other_publishers(), 'another node publishes on cmd_vel: end it, or remap one'),
-            (self.output.silence > self.navigator.limits.odometry_timeout, 'odometry is silent'),
-            (not self._listeners(), f'nobody is {self._listener_words()}'),
-        )
-        return tuple(words for broken, words in rules if broken)
-
-    def _who(self) -> str:
-        namespace = self.get_namespace().strip('/')
-        return f'{namespace}: ' if namespace else ''
-
-    def _other_publishers(self) -> int:
-        return max(0, self.count_publishers(self.output.publisher.topic_name) - 1)
-
-    def _listeners(self) -> list:
-        """Who else listens for the commands, in the type in which they are sent."""
-        mine = f'geometry_msgs/msg/{self.output.publisher.msg_type.__name__}'
-        me = (self.get_name(), self.get_namespace())
-        return [info for info in
-                self.get_subscriptions_info_by_topic(self.output.publisher.topic_name)
-                if info.topic_type == mine and (info.node_name, info.node_namespace) != me]
-
-    def _listener_words(self) -> str:
-        kind = self.output.publisher.msg_type
-        other = TwistStamped if kind is Twist else Twist
-        return (f'listening for {kind.__name__} on cmd_vel (for {other.__name__} set '
-                f'enable_stamped_cmd_vel to {str(kind is Twist).lower()})')
+        self._readiness.fail(reason)
 
     @property
     def _running(self) -> bool:

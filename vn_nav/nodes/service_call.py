@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 
-ASK_AGAIN = 5.0  # s without an answer after which it is asked again
+REPEAT_PERIOD_S = 5.0  # s without an answer after which it is asked again
 
 
 class ServiceCall:
@@ -22,7 +22,7 @@ class ServiceCall:
         again: time without an answer after which it is asked again [s].
     """
 
-    def __init__(self, client, request, *, again: float = ASK_AGAIN):
+    def __init__(self, client, request, *, again: float = REPEAT_PERIOD_S):
         self._client, self._request, self._again = client, request, again
         self._futures: list = []
         self._asked_at = -math.inf  # steady time [s]

@@ -4,7 +4,7 @@ The node runs as a process of its own, in mode shadow and lock-step; this proces
 of its robot. One thing is asked at a time, and answered before the next: the answers depend on the
 bag alone, not on the speed of the machine.
 
-No robot hears the commands, for three reasons, each enough: they leave neither this host (the
+No robot receives the commands, for three reasons, each enough: they leave neither this host (the
 Fast DDS profile) nor a ROS domain that nobody else is on, which is looked at all the time; and
 their topic is `shadow/cmd_vel` in a namespace that is made up for this run.
 """
@@ -46,7 +46,7 @@ def drive(plan: Plan, checkpoint: str | Path, out: str | Path, *, robot: Path | 
         robot: YAML file; None: the standard robot.
         decoding: 'sample' or 'greedy'; None: as the checkpoint was measured.
         domains: to choose from.
-        say: is told where the commands end.
+        say: called with a line about where the commands end.
 
     Raises:
         UserError: no free domain, somebody else there, a node that fails or falls silent, or no

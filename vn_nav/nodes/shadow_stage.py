@@ -23,7 +23,7 @@ from vn_msgs_py.topics import Topic, topic
 from vn_nav.bags.shadow.plan import STAMP_RESOLUTION_NS, Decision, Event, Plan, stamped
 from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.errors import UserError
-from vn_nav.nodes.policy_node import SHADOW_LIMIT
+from vn_nav.nodes.policy_node import SHADOW_LIMIT_S
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.nodes.qos import qos
@@ -38,7 +38,7 @@ ARMING_NS = 10_000_000_000, 1_000_000  # ns before the drive, and between the pi
 # What the policy publishes, by the names that the node gives it.
 SUBSCRIBED = {'shadow/cmd_vel': Twist, 'action': Int8, 'action_names': String, 'arrived': Bool,
               'diagnostics': DiagnosticArray}
-# What it is shown, beside the pictures.
+# What it is shown, besides the pictures.
 PUBLISHED = {'camera_info': CameraInfo, 'odom': Odometry, 'goal_image': Image, 'clock': Clock,
              'executed_action': String}
 ABSOLUTE = ('clock', 'diagnostics')  # in the contract; here they are in the namespace as well
@@ -86,11 +86,12 @@ class Stage:
                      for name, kind in (PUBLISHED | {image: kind}).items()}
         self._image = self._out[image]
         self._enabler = node.create_client(SetBool, 'policy_node/enable')
-        hear = {'shadow/cmd_vel': self._hear_command, 'action': self._hear_action,
-                'action_names': self._hear_names, 'arrived': self._hear_arrived,
-                'diagnostics': self._hear_diagnostics}
+        callbacks = {
+            'shadow/cmd_vel': self._on_command, 'action': self._on_action,
+            'action_names': self._on_names, 'arrived': self._on_arrived,
+            'diagnostics': self._on_diagnostics}
         for name, kind in SUBSCRIBED.items():
-            node.create_subscription(kind, name, self._recording(name, kind, hear[name]),
+            node.create_subscription(kind, name, self._recording(name, kind, callbacks[name]),
                                      qos(_contract(name), depth=100), raw=True)
         self._log_time = 0  # ns, by which the second bag has what is said now
         self._now = 0  # ns, of the node's clock
@@ -111,28 +112,28 @@ class Stage:
 
     # What the policy says.
 
-    def _recording(self, name: str, kind: type, hear: Callable) -> Callable[[bytes], None]:
+    def _recording(self, name: str, kind: type, handle: Callable) -> Callable[[bytes], None]:
         def take(data: bytes) -> None:
             self._bag.write(in_bag(name), data, self._log_time)
-            hear(deserialize_message(data, kind))
+            handle(deserialize_message(data, kind))
         return take
 
-    def _hear_command(self, message: Twist) -> None:
+    def _on_command(self, message: Twist) -> None:
         self._commands.append(twist_to_array(message))
 
-    def _hear_action(self, message: Int8) -> None:
+    def _on_action(self, message: Int8) -> None:
         self._choice = self._names[message.data]
 
-    def _hear_names(self, message: String) -> None:
+    def _on_names(self, message: String) -> None:
         self._names = json.loads(message.data)
 
-    def _hear_arrived(self, message: Bool) -> None:
+    def _on_arrived(self, message: Bool) -> None:
         self._statements += 1
         self._has_arrived = message.data
         if message.data:
             self._choice = 'arrived'
 
-    def _hear_diagnostics(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self._diagnosis = {pair.key: pair.value for pair in message.status[0].values}
 
     # What it is shown.
@@ -146,12 +147,12 @@ class Stage:
                     self._take(event)
                 if self._picture and time.monotonic() - self._shown_at > REPEAT_PERIOD_S:
                     self._show(self._picture, 0)  # the node's watchdog looks at the wall clock
-            self._hear_the_last_counts()
+            self._wait_for_last_counts()
         except _Interrupted:
             return False
         return True
 
-    def _hear_the_last_counts(self) -> None:
+    def _wait_for_last_counts(self) -> None:
         """Diagnostics come once a second: those after the last decision belong in the bag."""
         end = time.monotonic() + DIAGNOSTICS_TIMEOUT_S
         while (int(self._diagnosis.get('filter_decisions', len(self.latencies)))
@@ -170,21 +171,22 @@ class Stage:
             self._tick(event.stamp)
 
     def _decide(self, event: Event, decision: Decision) -> None:
-        """Show a picture and hear what the policy would do there."""
+        """Show a picture and receive what the policy would do there."""
         if decision.episode != self._episode:
             self._begin(event, decision.episode)
         elif self._has_arrived:
             self._look_again()
         stamp = max(event.stamp, self._picture_stamp + STAMP_RESOLUTION_NS)
-        told = String(data=json.dumps({'stamp': divmod(stamp, 10**9), 'action': decision.done}))
-        self._out['executed_action'].publish(told)
-        self._bag.write(in_bag('executed_action'), serialize_message(told), self._log_time)
+        executed = String(data=json.dumps({'stamp': divmod(stamp, 10**9),
+                                           'action': decision.done}))
+        self._out['executed_action'].publish(executed)
+        self._bag.write(in_bag('executed_action'), serialize_message(executed), self._log_time)
         self._choice, begun = None, time.monotonic()
         self._show(event.picture_data, stamp)
         self._until(lambda: self._choice is not None, 'a decision', resend=True)
         self.latencies.append(time.monotonic() - begun)
-        if self.latencies[-1] > SHADOW_LIMIT:  # the node has discarded it
-            raise UserError(f'a decision takes less than {SHADOW_LIMIT:g} s',
+        if self.latencies[-1] > SHADOW_LIMIT_S:  # the node has discarded it
+            raise UserError(f'a decision takes less than {SHADOW_LIMIT_S:g} s',
                             f'{self.latencies[-1]:.1f} s',
                             'try again when the machine is less busy')
         if self._rests and not self._has_arrived:

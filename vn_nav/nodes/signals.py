@@ -18,7 +18,7 @@ from typing import NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 
 
-def heard() -> list[signal.Signals]:
+def ending_signals() -> list[signal.Signals]:
     """The signals that end a node; not SIGHUP where `nohup` has it ignored."""
     return [number for number in SIGNALS
             if not (number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN)]
@@ -26,13 +26,13 @@ def heard() -> list[signal.Signals]:
 
 def exit_at_once() -> None:
     """From now on a signal ends the process with exit code 0: there is nothing to stop yet."""
-    for number in heard():
+    for number in ending_signals():
         signal.signal(number, lambda *_: os._exit(0))
 
 
 def ignore() -> None:
     """From now on signals do nothing: the process ends anyway."""
-    for number in heard():
+    for number in ending_signals():
         signal.signal(number, signal.SIG_IGN)
 
 
@@ -46,7 +46,8 @@ class Ended:
     def __init__(self):
         self._ended = False
         self._let_go: Callable[[], None] | None = None
-        self._before = {number: signal.signal(number, self._on_signal) for number in heard()}
+        self._before = {number: signal.signal(number, self._on_signal)
+                        for number in ending_signals()}
 
     def _on_signal(self, *_):
         self._ended = True

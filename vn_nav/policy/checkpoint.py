@@ -21,7 +21,6 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.files import sync_folder, write_file
-from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint_info import (
     CARD,
     CHECKSUM,
@@ -33,11 +32,12 @@ from vn_nav.policy.checkpoint_info import (
     config_checksum,
     read_config,
 )
+from vn_nav.policy.model_card import model_card
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.zhu_policy import build_policy
 
-HEADER_BYTES = 1_000_000  # of a safetensors file, beside its weights
+HEADER_BYTES = 1_000_000  # of a safetensors file, without its weights
 MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
 
 
@@ -214,95 +214,6 @@ def _check_weights(weights: bytes, wanted: dict[str, tuple], where: str
             raise UserError('weights are finite numbers of 16 or 32 bits', f'{name} in {where}',
                             'get the checkpoint again')
     return {name: tensor.float() for name, tensor in tensors.items()}
-
-
-def model_card(config: dict, parameters: int, size: int) -> str:
-    """The README of a checkpoint, from the content of its `config.json`."""
-    network = config['network']
-    side, scenes = network['size'], config['scenes']
-    home = 'its training environment'
-    if scenes:
-        home = (f'{len(scenes)} scene{"s" * (len(scenes) > 1)} ({", ".join(scenes[:8])}'
-                f'{", ..." * (len(scenes) > 8)})')
-    facts = {
-        'Input': f'RGB {side} x {side} from a camera {config["camera_height"]:g} m above the '
-                 f'floor, {config["camera_fov_deg"]:g} deg field of view; the goal picture alike',
-        'Actions': ', '.join(config['action_names']),
-        'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
-            config['decoding']],
-        'Network': f'{_describe(network)}; {parameters:,} parameters, {size / 1e6:.1f} MB',
-        **({'Action filter': 'blocked actions: an action without progress is not repeated '
-            'from the same place; part of every figure (docs/method.md)'}
-           if network.get('action_filter', NONE) != NONE else {}),
-        'Trained in': config['data'] or home,
-        **({'Losses': ', '.join(config['losses']).replace('_', ' ')} if config['losses'] else {}),
-        'Training': ('no episode was driven; ' if config['data'] and not config['frames'] else
-                     f'{config["frames"]:,} frames (agent decisions) in ')
-        + f'{config["minutes"]:.1f} minutes, seed {config["seed"]}',
-        'World version': config['world_version'],
-        'Weights': f'SHA-256 `{config["sha256"]}`',
-    }
-    purpose = ('Drives a robot to the place where a picture was taken.' if not config['losses']
-               else 'Weights to begin a training with (`vn_nav train --init`), pre-trained on '
-               'recorded pictures. No episode was driven: whether it arrives is not known.')
-    lines = ['# Visual navigation policy', '',
-             f'{purpose} It sees its camera, the goal picture and its own last action; no map, no '
-             'depth, no pose.', '',
-             '| | |', '|---|---|', *(f'| {key} | {value} |' for key, value in facts.items())]
-    if config['command']:
-        lines += ['', 'Trained with', '', '```', str(config['command']), '```']
-    lines += ['', '## Measured', '']
-    lines += _results_table(config['results']) or ['Nothing yet.']
-    if config['notes']:
-        lines += ['', '## Notes', '', str(config['notes'])]
-    return '\n'.join(lines) + '\n'
-
-
-def _describe(network: dict) -> str:
-    """The network in words."""
-    if network['architecture'] == 'icra2017':
-        frozen = {'': 'the small random encoder', 'resnet50': 'ResNet-50'}[network['frozen']]
-        return (f'Zhu et al. 2017 on frozen features of {frozen}; {network["frames"]} stacked '
-                f'frames; layers for {network["scenes"]} scene{"s" * (network["scenes"] > 1)}')
-    words = {'thesis': "the thesis's two streams", 'unreal': "UNREAL's single stream",
-             'fused': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
-                      f'goal fused in the first; {network["features"]} features',
-             'matching': f'convolutions {" / ".join(map(str, network["channels"]))}, picture and '
-                         'goal compared place by place (correlation volume); '
-                         f'{network["features"]} features'}[
-        network['architecture']]
-    if network['blocks']:
-        words += f'; {network["blocks"]} residual block(s) a stage'
-    if network.get('moves'):
-        words += '; the goal tracked by dead reckoning'
-    words += (f'; {network["frames"]} stacked frames' if network['frames'] > 1
-              else f'; LSTM {network["hidden"]}')
-    heads = ', '.join(network['heads']).replace('_', ' ')
-    return words + (f'; heads {heads}' if heads else '')
-
-
-def _results_table(results: dict) -> list[str]:
-    """One row for each nested mapping, its figures as columns; other values as a list."""
-    rows = {name: row for name, row in results.items() if isinstance(row, dict)}
-    lines = []
-    if rows:
-        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
-        lines += ['| | ' + ' | '.join(key.replace('_', ' ') for key in columns) + ' |',
-                  '|---' * (len(columns) + 1) + '|']
-        lines += [f'| {name.replace("_", " ")} | '
-                  + ' | '.join(_figure(row.get(key, '')) for key in columns) + ' |'
-                  for name, row in rows.items()]
-    single = [f'- {name.replace("_", " ")}: {_figure(value)}' for name, value in results.items()
-              if name not in rows]
-    return lines + ([''] if rows and single else []) + single
-
-
-def _figure(value: object) -> str:
-    if isinstance(value, float):
-        return f'{value:.3g}' if abs(value) < 1000 else f'{value:,.0f}'
-    if isinstance(value, (list, tuple)):
-        return ' to '.join(_figure(part) for part in value)
-    return str(value)
 
 
 def _write_folder(folder: Path, files: dict[str, bytes]) -> None:

@@ -15,11 +15,11 @@ from vn_nav.structured_file import read_json
 
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
 FORMAT = 2
-OWN = {'format', 'network', 'action_names', 'sha256'}  # keys beside those of INFO
+OWN = {'format', 'network', 'action_names', 'sha256'}  # keys that are not of INFO
 CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
 DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
-# What a checkpoint says beside its weights, and its defaults.
+# What a checkpoint says besides its weights, and the defaults.
 INFO: dict[str, Any] = {
     'world_version': REQUIRED,  # of the simulator's pixels, places and motion
     'camera_fov_deg': REQUIRED,  # of the square picture
@@ -38,7 +38,7 @@ INFO: dict[str, Any] = {
     'frames': 0,  # agent decisions
     'minutes': 0.0,  # wall-clock of training
     'command': '',  # that trained it
-    'data': '',  # recorded pictures that it learned from, in words; empty: it learned by driving
+    'data': '',  # recorded pictures that it learned from, a text; empty: it learned by driving
     'losses': [],  # what `vn_nav pretrain` learned; no episode was driven
     'results': {},  # measured figures and controls, by name
     'notes': '',

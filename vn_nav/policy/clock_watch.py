@@ -20,7 +20,7 @@ class ClockWatch:
         self._steady = 0.0
 
     def look(self, clock: float, steady: float) -> str:
-        """What happened to the clock since the last look, in words; empty: nothing.
+        """What happened to the clock since the last look, a text; empty: nothing.
 
         Args:
             clock: what it says now [s]; 0: it has not begun.

@@ -199,7 +199,7 @@ class Matching(nn.Module):
         as of `Fused`; blocks: after the pictures have met.
     """
 
-    SCALE = 3.0  # of similarities in [-1, 1], beside maps of about that size
+    SCALE = 3.0  # of similarities in [-1, 1], among maps of about that size
 
     def __init__(self, size: int, channels: tuple[int, int, int], features: int, blocks: int,
                  mean: float, std: float, frames: int = 1):

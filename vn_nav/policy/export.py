@@ -1,4 +1,4 @@
-"""A checkpoint as ONNX, for robots without PyTorch: `policy.onnx`, and `goal.onnx` beside it.
+"""A checkpoint as ONNX, for robots without PyTorch: `policy.onnx`, and `goal.onnx` with it.
 
 `goal.onnx` runs once for each goal: `picture` uint8 [1,3,S,S] -> `goal`. A policy that looks at no
 goal has none. `policy.onnx` is one decision of one robot. It has those of these inputs and outputs
@@ -64,8 +64,8 @@ def export_onnx(checkpoint: LoadedCheckpoint, folder: str | Path) -> list[Path]:
         folder: where; made if need be. Files of an earlier export are replaced.
 
     Returns:
-        The models: `policy.onnx`, and `goal.onnx` if the policy looks at goals. `README.md` beside
-        them says how they are used.
+        The models: `policy.onnx`, and `goal.onnx` if the policy looks at goals. `README.md` says
+        how they are used.
 
     Raises:
         UserError: the package onnx is not installed, or the folder cannot be written.
@@ -187,7 +187,7 @@ def _signature(values) -> str:
 def _readme(step: _Step, checkpoint: LoadedCheckpoint) -> str:
     """What the folder holds, and a decision in Python that runs as it stands."""
     config, info = checkpoint.config, checkpoint.info
-    words = 'none. Actions are chosen by the logits as they are.'
+    about = 'none. Actions are chosen by the logits as they are.'
     code = ['import json', '', 'import numpy as np', 'import onnxruntime', '',
             f"policy = onnxruntime.InferenceSession('{POLICY}')",
             'facts = policy.get_modelmeta().custom_metadata_map',
@@ -201,7 +201,7 @@ def _readme(step: _Step, checkpoint: LoadedCheckpoint) -> str:
                  "inputs['goal'], = goal.run(None, {'picture': goal_picture})  # uint8 [1,3,S,S]"]
     logits = "said['logits']"
     if config.filter_name != NONE:
-        words = (f'`{config.filter_name}`. It is no part of the network; the figures of the '
+        about = (f'`{config.filter_name}`. It is no part of the network; the figures of the '
                  'checkpoint were measured behind it.\nAdd its offsets to the logits, once for '
                  'each decision, as below.')
         code.insert(4, 'from vn_nav.policy.action_filter import BlockedActionFilter  # NumPy')
@@ -220,7 +220,7 @@ def _readme(step: _Step, checkpoint: LoadedCheckpoint) -> str:
         '# A visual navigation policy as ONNX', '',
         f'Exported by vn_nav from weights with SHA-256 `{info["sha256"]}`.', 'The metadata of the '
         'files say what pictures, actions, inputs and outputs are.', '',
-        f'Decoding: {info["decoding"]}. Action filter: {words}', '',
+        f'Decoding: {info["decoding"]}. Action filter: {about}', '',
         '```python', *code, '```', '',
         'An episode begins, with `last_action` -1, at a new goal and where the robot was moved.',
         ''])

@@ -18,7 +18,7 @@ class FrameGate:
 
     Attributes:
         dropped: frames that were dropped, by kind: never more than four keys.
-        last: why the newest of them was, in words.
+        last: why the newest of them was.
     """
 
     def __init__(self, max_age: float, max_ahead: float):
@@ -35,7 +35,7 @@ class FrameGate:
         """Seconds by which a frame shows that its clock was set back; 0: it was not.
 
         Two frames that both agree with one clock lie within `max_age` + `max_ahead` of each
-        other: a frame that agrees with it, and lies further back, tells of another time.
+        other: a frame that agrees with it, and lies further back, is of another time.
         """
         back = self._stamp - stamp
         agrees = clock is None or -self.max_ahead <= clock - stamp <= self.max_age

@@ -44,7 +44,7 @@ class GoalWatch:
         return new
 
     def warning(self, now: float) -> str:
-        """What is wrong with how goals are published, in words; empty: nothing."""
+        """What is wrong with how goals are published; empty: nothing."""
         recent = [(at, new) for at, new in self._heard if now - at <= RATE_S]
         if self._trust_stamps or len(recent) < 4 or now - recent[-1][0] > AGAIN_S:
             return ''

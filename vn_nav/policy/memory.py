@@ -114,8 +114,8 @@ class MaskedLSTM(nn.Module):
 class GoalTracker(nn.Module):
     """Where the goal stands relative to the robot, carried along while it is out of sight.
 
-    A filter without weights to learn: each action moves the estimate by what the robot was told to
-    do (dead reckoning), and each look at the goal corrects it by its confidence against that of
+    A filter without weights to learn: each action moves the estimate as commanded (dead
+    reckoning), and each look at the goal corrects it by its confidence against that of
     the estimate, which fades with every move. The memory sees the estimate.
 
     Args:

@@ -13,24 +13,11 @@ from torch import Tensor, nn
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.encoders import Encoder, Fused, Matching, OneStream, TwoStreams
-from vn_nav.policy.heads import (
-    GoalPose,
-    ImageHead,
-    PixelControl,
-    Pose,
-    RewardPrediction,
-    Scalar,
-    grown,
-)
-from vn_nav.policy.memory import (
-    Feedforward,
-    GoalTracker,
-    MaskedLSTM,
-    RecurrentState,
-    stack_frames,
-)
-from vn_nav.policy.network_config import IMAGE_HEADS, NetworkConfig
+from vn_nav.policy.encoders import Encoder
+from vn_nav.policy.heads import Pose, grown
+from vn_nav.policy.memory import Feedforward, GoalTracker, MaskedLSTM, RecurrentState, stack_frames
+from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.network_parts import PUBLISHED, build_encoder, build_head, initialise
 from vn_nav.policy.places import WIDTH, MultiViewAveraging, PathAdvice, PlaceClassifier
 from vn_nav.policy.zhu import SceneLinear, Siamese
 
@@ -40,7 +27,7 @@ CHUNK_BYTES = 2**24
 
 
 class PolicyOutput(NamedTuple):
-    """What the network says; float32."""
+    """Outputs of the network; float32."""
 
     logits: Tensor  # [T,B,A] unnormalised log-probabilities
     value: Tensor  # [T,B] of the state
@@ -93,17 +80,8 @@ class Policy(nn.Module):
         if config.architecture == 'icra2017':
             raise UserError('a policy of icra2017 is made by zhu_policy.build_policy',
                             config.architecture, 'call that')
-        pixels = config.pixel_mean, config.pixel_std, config.frames
-        thesis = config.architecture in ('thesis', 'unreal')
-        encoder: Encoder
-        if thesis:
-            published: type[TwoStreams | OneStream] = (
-                TwoStreams if config.architecture == 'thesis' else OneStream)
-            encoder = published(config.size, *pixels)
-        else:
-            own: type[Fused | Matching] = Fused if config.architecture == 'fused' else Matching
-            encoder = own(config.size, config.channels, config.features, config.blocks, *pixels)
-        self.encoder = encoder
+        thesis = config.architecture in PUBLISHED
+        self.encoder = encoder = build_encoder(config)
         inputs = (encoder.features + len(config.actions) + 1
                   + (5 if config.pose_to_memory else 0)
                   + (GoalTracker.WIDTH if config.moves else 0)
@@ -127,25 +105,13 @@ class Policy(nn.Module):
         self.actor = actor = nn.Linear(config.hidden, len(config.actions))
         self.critic = critic = nn.Linear(config.hidden, 1)
         for layer, gain in ((actor, 0.01), (critic, 1.0)):
-            _initialise(layer, gain, thesis)
+            initialise(layer, gain, thesis)
         channels, side = encoder.maps
         self.target_side = grown(side, config.deconvolutions)
         self.cell = max(config.size // self.target_side, 1)
-        self.heads = nn.ModuleDict({name: self._head(name, channels, side)
-                                    for name in config.heads})
-
-    def _head(self, name: str, channels: int, side: int) -> nn.Module:
-        config = self.config
-        if name == 'pixel_control':
-            return PixelControl(config.hidden, len(config.actions), side, config.deconvolutions)
-        if name == 'reward_prediction':
-            return RewardPrediction(channels * side**2)
-        if name in IMAGE_HEADS:
-            out, width = IMAGE_HEADS[name]
-            return ImageHead(channels, width, out, config.deconvolutions)
-        if name == 'goal_pose':
-            return GoalPose(self.encoder.features)
-        return Scalar(config.hidden)
+        self.heads = nn.ModuleDict({
+            name: build_head(name, config, channels, side, encoder.features)
+            for name in config.heads})
 
     def initial_state(self, batch: int) -> RecurrentState:
         """An empty memory."""
@@ -154,8 +120,8 @@ class Policy(nn.Module):
             return RecurrentState(self._frames_before(batch),
                                   torch.zeros(batch, 0, device=self.device))
         zeros = torch.zeros(batch, config.hidden, device=self.device)
-        beside = torch.zeros(batch, sum(self._beside), device=self.device)
-        return RecurrentState(torch.cat([zeros, beside], dim=1), zeros.clone())
+        carried = torch.zeros(batch, sum(self._carried), device=self.device)
+        return RecurrentState(torch.cat([zeros, carried], dim=1), zeros.clone())
 
     def _frames_before(self, batch: int) -> Tensor:
         """What stands for the frames before an episode, [batch,frames-1,...]."""
@@ -164,8 +130,8 @@ class Policy(nn.Module):
                            dtype=torch.uint8, device=self.device)
 
     @property
-    def _beside(self) -> tuple[int, int]:
-        """Numbers that are remembered beside the memory's: by tracker, by multi-view averaging."""
+    def _carried(self) -> tuple[int, int]:
+        """Numbers carried along with the memory's: by tracker, by multi-view averaging."""
         return (0 if self.tracker is None else GoalTracker.WIDTH,
                 0 if self.around is None else self.around.width)
 
@@ -237,9 +203,9 @@ class Policy(nn.Module):
             if self.config.pose_to_memory:
                 inputs.append(_compass(pose).view(steps, batch, -1).to(dtype))
         own = state
-        beside: list[Tensor] = []
-        if any(self._beside):
-            hidden, tracked, looked = state.hidden.split((self.config.hidden, *self._beside), 1)
+        carried: list[Tensor] = []
+        if any(self._carried):
+            hidden, tracked, looked = state.hidden.split((self.config.hidden, *self._carried), 1)
             own = RecurrentState(hidden, state.cell)
         if self.tracker is not None:
             assert pose is not None  # moves are given with pose_to_memory alone
@@ -247,7 +213,7 @@ class Policy(nn.Module):
                 *(part.detach().view(steps, batch, *part.shape[1:]) for part in pose),
                 obs.last_action, starts, tracked)
             inputs.append(seen.to(dtype))
-            beside.append(tracked)
+            carried.append(tracked)
         if self.places is not None:
             assert self.routes is not None and goal_places is not None  # made with the places
             if obs.goal_index is not None:
@@ -257,13 +223,13 @@ class Policy(nn.Module):
                 here, looked = self.around(here.view(steps, batch, -1), obs.last_action, starts,
                                            looked)
                 here = here.flatten(0, 1)
-                beside.append(looked)
-            told, advice = self.routes(here.to(dtype), goal_places)
-            inputs.append(told.view(steps, batch, -1))
+                carried.append(looked)
+            place, advice = self.routes(here.to(dtype), goal_places)
+            inputs.append(place.view(steps, batch, -1))
             advice = advice.view(steps, batch, -1)
         hidden, state = self.memory(torch.cat(inputs, dim=-1), starts, own)
-        if beside:
-            state = RecurrentState(torch.cat([state.hidden, *beside], dim=1), state.cell)
+        if carried:
+            state = RecurrentState(torch.cat([state.hidden, *carried], dim=1), state.cell)
         return Latents(maps, features, hidden, pose, advice=advice), state
 
     def maps(self, obs: Observation, starts: Tensor | None = None) -> Tensor:
@@ -321,19 +287,10 @@ class Policy(nn.Module):
             goal_maps: `encode_goals(obs.goals)`, if it is known already.
 
         Returns:
-            What the network says, and the memory after the last row.
+            The outputs, and the memory after the last row.
         """
         latents, state = self.latents(obs, starts, state, goal_maps)
         return self.read(latents), state
-
-
-def _initialise(layer: nn.Linear, gain: float, thesis: bool) -> None:
-    if thesis:
-        bound = layer.in_features**-0.5
-        nn.init.uniform_(layer.weight, -bound, bound)
-    else:
-        nn.init.orthogonal_(layer.weight, gain)
-    nn.init.zeros_(layer.bias)
 
 
 def _compass(pose: Pose) -> Tensor:
@@ -343,26 +300,3 @@ def _compass(pose: Pose) -> Tensor:
     """
     sure = torch.sigmoid(pose.co_visible).unsqueeze(1)
     return torch.cat([sure * pose.position / 3.0, sure * pose.heading, sure], dim=1).detach()
-
-
-class GoalMaps:
-    """What the encoder keeps of the goal of each of N environments, encoded when it changes.
-
-    Valid while the weights stay: make a new one after an update.
-    """
-
-    def __init__(self, network: Policy):
-        self.network = network
-        self._index: Tensor | None = None
-        self._maps: Tensor | None = None
-
-    def of(self, goals: Tensor, goal_index: Tensor) -> Tensor:
-        """[N,...] for the goals `goals`[goal_index]; the network then takes None as the index."""
-        if self._index is None or self._maps is None:  # nothing is kept yet
-            self._maps = self.network.encode_goals(goals[goal_index])
-        else:
-            changed = torch.nonzero(goal_index != self._index).squeeze(1)
-            if len(changed):
-                self._maps[changed] = self.network.encode_goals(goals[goal_index[changed]])
-        self._index = goal_index.clone()
-        return self._maps

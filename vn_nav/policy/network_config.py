@@ -94,7 +94,7 @@ class NetworkConfig:
              'a frozen encoder and layers of scenes belong to the architecture icra2017',
              self.architecture),
             (self.architecture != 'icra2017' or not self.heads,
-             'the architecture icra2017 has no heads beside actor and critic', self.heads),
+             'the architecture icra2017 has no heads but actor and critic', self.heads),
         )
         for kept, rule, received in rules:
             if not kept:

@@ -91,8 +91,8 @@ class PlaceClassifier(nn.Module):
 class MultiViewAveraging(nn.Module):
     """Multi-view averaging: while a robot turns, the mean of what its pictures say of its place.
 
-    One direction often looks like two places, and of a robot that hears another one with every
-    turn the advice turns it to and fro. Probabilities are averaged (a mixture), not multiplied:
+    One direction often looks like two places. If the place changed with every turn, the advice
+    would turn the robot to and fro. Probabilities are averaged (a mixture), not multiplied:
     pictures of one place are anything but independent.
 
     Args:

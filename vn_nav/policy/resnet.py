@@ -114,7 +114,7 @@ def load_frozen_weights(encoder: nn.Module, path: str | Path) -> None:
     """Weights of a frozen encoder from a file: safetensors, or what `torch.save` wrote.
 
     All of the encoder's tensors have to be there, and nothing else but the classifier and the
-    counters that torch keeps beside batch statistics.
+    counters that torch keeps with batch statistics.
 
     Raises:
         UserError: no such file, another kind of file, other tensors, or numbers not finite.
@@ -129,9 +129,9 @@ def load_frozen_weights(encoder: nn.Module, path: str | Path) -> None:
             given = torch.load(path, map_location='cpu', weights_only=True)
     except (safetensors.SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError,
             ValueError, KeyError) as error:
-        words = str(error).partition('\n')[0] or type(error).__name__
+        reason = str(error).partition('\n')[0] or type(error).__name__
         raise UserError('frozen weights are a state dict, as safetensors or as torch.save writes '
-                        'it', f'{path}: {words}', 'get the file again') from error
+                        'it', f'{path}: {reason}', 'get the file again') from error
     if not isinstance(given, dict) or not all(isinstance(t, Tensor) for t in given.values()):
         raise UserError('frozen weights are a state dict: tensors by name',
                         f'{type(given).__name__} in {path}', 'save model.state_dict() alone')

@@ -13,8 +13,9 @@ from vn_nav.observation import Observation
 from vn_nav.policy.action_filter import FilterCounts, make_filter
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
+from vn_nav.policy.goal_maps import GoalMaps
 from vn_nav.policy.memory import RecurrentState
-from vn_nav.policy.network import GoalMaps, Policy
+from vn_nav.policy.network import Policy
 from vn_nav.policy.zhu import check_scenes
 
 

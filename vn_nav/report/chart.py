@@ -30,11 +30,11 @@ class Line:
 
 @dataclasses.dataclass(frozen=True)
 class Text:
-    """Words; `anchor` is start, middle or end."""
+    """Text; `anchor` is start, middle or end."""
 
     x: float
     y: float  # of the base line
-    words: str
+    content: str
     anchor: str = 'start'
     colour: str = 'soft'
     size: int = 12
@@ -159,7 +159,7 @@ def to_svg(shapes: Sequence[Shape], width: float, height: float, label: str, *,
             parts.append(
                 f'<text x="{shape.x:.1f}" y="{shape.y:.1f}" text-anchor="{shape.anchor}" '
                 f'style="font:{shape.size}px {FONT};fill:var(--{shape.colour})">'
-                f'{html.escape(shape.words)}</text>')
+                f'{html.escape(shape.content)}</text>')
             continue
         points = ' '.join(f'{x:.1f},{y:.1f}' for x, y in shape.points)
         if shape.filled:
@@ -184,9 +184,9 @@ def to_picture(shapes: Sequence[Shape], width: float, height: float, *, zoom: fl
     for shape in shapes:
         if isinstance(shape, Text):
             size = shape.size * zoom / 30
-            (wide, _), _ = cv2.getTextSize(shape.words, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+            (wide, _), _ = cv2.getTextSize(shape.content, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
             x = shape.x * zoom - {'start': 0, 'middle': wide / 2, 'end': wide}[shape.anchor]
-            cv2.putText(image, shape.words, (round(x), round(shape.y * zoom)),
+            cv2.putText(image, shape.content, (round(x), round(shape.y * zoom)),
                         cv2.FONT_HERSHEY_SIMPLEX, size, _rgb(shape.colour), 1, cv2.LINE_AA)
             continue
         layer = image.copy()

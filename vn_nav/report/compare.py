@@ -102,23 +102,23 @@ def cells(result: dict[str, dict]) -> tuple[list[str], list[list[str]]]:
     return [*headings, 'success at the end'], lines
 
 
-def _when(points: list[float | None], limits: list[float], words: str, unit: float = 1.0) -> str:
+def _when(points: list[float | None], limits: list[float], form: str, unit: float = 1.0) -> str:
     """When runs reached something, or for how long they did not."""
     got = sorted(unit * point for point in points if point is not None)
     missed = [unit * limit for point, limit in zip(points, limits, strict=True) if point is None]
     if not missed:
-        return _spread(got, words)
-    never = f'not reached within {min(missed):{words}}'
+        return _spread(got, form)
+    never = f'not reached within {min(missed):{form}}'
     if not got:
         return never
-    return f'{", ".join(f"{p:{words}}" for p in got)}; {len(missed)} of {len(points)} {never}'
+    return f'{", ".join(f"{p:{form}}" for p in got)}; {len(missed)} of {len(points)} {never}'
 
 
-def _spread(values: list[float], words: str) -> str:
-    mean = f'{sum(values) / len(values):{words}}'
+def _spread(values: list[float], form: str) -> str:
+    mean = f'{sum(values) / len(values):{form}}'
     if len(values) == 1:
         return mean
-    return f'{mean} ({min(values):{words}}-{max(values):{words}})'
+    return f'{mean} ({min(values):{form}}-{max(values):{form}})'
 
 
 def _ends(own: dict) -> str:
@@ -136,10 +136,10 @@ def _page(svg: str, groups: dict[str, list[Run]], result: dict, metric: str, ban
                  [[html.escape(label), html.escape(str(run.path)),
                    f'{run.columns["frames"][-1]:,.0f}', f'{run.columns["minutes"][-1]:.1f}']
                   for label, own in groups.items() for run in own], text=2)
-    words = {'range': 'from the smallest to the largest',
+    bands = {'range': 'from the smallest to the largest',
              'std': 'one standard deviation each way'}[band]
     return page('vn_nav compare', f"""<h1>Learning curves: {html.escape(metric)}</h1>
-<p class="soft">Lines are means over runs that differ in their seed, bands go {words}; both end
+<p class="soft">Lines are means over runs that differ in their seed, bands go {bands}; both end
 where the shortest of these runs ends. Dashed: inside the curriculum, whose episodes start nearer
 to the goal, so that no success there counts.</p>
 <figure>{svg}</figure>

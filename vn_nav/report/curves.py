@@ -15,9 +15,9 @@ from vn_nav.errors import UserError
 METRICS = 'metrics.csv'
 NEEDED = ('frames', 'minutes', 'tau', 'success')
 THRESHOLDS = (0.5, 0.9)  # of success
-FULL = 0.999  # a tau from here on is 1: starts as far from the goal as in the evaluation
-HOLD = 0.1  # of a run: how long a success has to hold on average
-POINTS = 240  # of a curve
+FULL_TAU = 0.999  # a tau from here on is 1: starts as far from the goal as in the evaluation
+HOLD_SHARE = 0.1  # of a run: how long a success has to hold on average
+CURVE_POINTS = 240  # of a curve
 SMOOTHING = 0.02  # of the axis: width of the running mean
 SEED = re.compile(r'[-_](?:seed|s)\d+$')
 
@@ -35,7 +35,7 @@ class Run:
 class Curve:
     """The mean over seeds on a common grid, as far as all of them go."""
 
-    x: np.ndarray  # [POINTS] frames or minutes
+    x: np.ndarray  # [CURVE_POINTS] frames or minutes
     mean: np.ndarray
     low: np.ndarray  # of the band
     high: np.ndarray
@@ -123,14 +123,14 @@ def average(runs: Sequence[Run], axis: str, metric: str, *, band: str = 'range',
         known = np.isfinite(y) & (x > 0)
         seeds.append((forward(x[known]), y[known], forward(x[x > 0]), run.columns['tau'][x > 0]))
     begin, end = max(u[0] for u, *_ in seeds), min(u[-1] for u, *_ in seeds)
-    grid = np.linspace(begin, end, POINTS)
+    grid = np.linspace(begin, end, CURVE_POINTS)
     values = np.array([_smooth(u, y, grid, SMOOTHING * (end - begin)) for u, y, *_ in seeds])
     taus = np.array([tau[np.clip(np.searchsorted(u, grid, side='right') - 1, 0, None)]
                      for *_, u, tau in seeds])
     mean, spread = values.mean(axis=0), values.std(axis=0)
     low, high = ((mean - spread, mean + spread) if band == 'std'
                  else (values.min(axis=0), values.max(axis=0)))
-    return Curve(back(grid), mean, low, high, np.all(taus >= FULL, axis=0))
+    return Curve(back(grid), mean, low, high, np.all(taus >= FULL_TAU, axis=0))
 
 
 def _smooth(x: np.ndarray, y: np.ndarray, grid: np.ndarray, width: float) -> np.ndarray:
@@ -160,8 +160,8 @@ def reached(run: Run, threshold: float) -> tuple[float, float] | None:
         threshold: of the success, the trainer's mean over its last 200 episodes.
     """
     frames, success = run.columns['frames'], run.columns['success']
-    for k in np.nonzero((run.columns['tau'] >= FULL) & (success >= threshold))[0]:
-        following = (frames >= frames[k]) & (frames <= frames[k] + HOLD * frames[-1])
+    for k in np.nonzero((run.columns['tau'] >= FULL_TAU) & (success >= threshold))[0]:
+        following = (frames >= frames[k]) & (frames <= frames[k] + HOLD_SHARE * frames[-1])
         if np.nanmean(success[following]) >= threshold:
             return float(frames[k]), float(run.columns['minutes'][k])
     return None
@@ -177,7 +177,8 @@ def summary(groups: dict[str, list[Run]]) -> dict[str, dict]:
     """
     result = {}
     for label, runs in groups.items():
-        ends = [run.columns['frames'] >= (1 - HOLD) * run.columns['frames'][-1] for run in runs]
+        ends = [run.columns['frames'] >= (1 - HOLD_SHARE) * run.columns['frames'][-1]
+                for run in runs]
         success = [run.columns['success'][end] for run, end in zip(runs, ends, strict=True)]
         result[label] = {
             'runs': [str(run.path) for run in runs],

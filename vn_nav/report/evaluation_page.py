@@ -17,7 +17,7 @@ from vn_nav.report.page import cards, page
 from vn_nav.report.tables import SPLITS, TITLES, number, rows_html, scenes_html
 
 MAPS = 6  # of a split, unless the user asks for another number
-WORDS = f"""<h2>Definitions</h2><dl>
+DEFINITIONS = f"""<h2>Definitions</h2><dl>
 <dt>Arrival</dt><dd>The simulator ends an episode as soon as the robot stands, at the end of a
 decision, within {ARRIVAL_RADIUS:g} m of the goal (driving distance) and faces within
 {math.degrees(ARRIVAL_HEADING):g} degrees of the picture's
@@ -58,7 +58,7 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
 {result['max_decisions']} decisions an episode, seed {result['seed']}. vn_nav {__version__},
 {result['date']}.</p>
 {body}
-{WORDS}""")
+{DEFINITIONS}""")
 
 
 def _split(name: str, split: dict, rows: Rows, plans: dict[str, dict | None], result: dict,
@@ -91,14 +91,14 @@ distance {number(own['start_distance'], '.1f')} m.</p>
 def _cards(rows: dict[str, dict], stop: str) -> str:
     own = next(iter(rows.values()))
 
-    def beside(key: str, words: str) -> str:
-        return '; '.join(f'{name} {number(rows[name][key], words)}'
+    def others(key: str, form: str) -> str:
+        return '; '.join(f'{name} {number(rows[name][key], form)}'
                          for name in (WRONG, BLANK, RANDOM) if name in rows)
     low, high = own['success_interval']
     entries = [
         (f'{own["success"]:.0%}', f'success, {TITLES[stop].lower()} ({low:.0%} to {high:.0%})',
-         beside('success', '.0%')),
-        (number(own['spl'], '.2f'), 'SPL', beside('spl', '.2f')),
+         others('success', '.0%')),
+        (number(own['spl'], '.2f'), 'SPL', others('spl', '.2f')),
         (f'{own["collisions"]:.1%}', 'decisions with a collision',
          f'{own["contact_free_success"]:.0%} succeeded without any'),
         (f'{own["decisions"]:.0f}', 'decisions an episode', f'{own["seconds"]:.0f} s of driving'),
@@ -131,7 +131,7 @@ def choose(episodes: Sequence[Episode], count: int) -> list[Episode]:
 
 
 def outcome(episode: Episode) -> str:
-    """How an episode ended, in words."""
+    """How an episode ended."""
     if episode.declared is None:
         return 'arrived' if episode.success else 'gave up'
     if episode.declared:

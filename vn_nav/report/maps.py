@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-SCALE = 46  # pixels per metre
-MARGIN = 0.3  # m around the house
-STILL = 0.02  # m: smaller steps add no points to a line
+PIXELS_PER_M = 46  # pixels per metre
+MARGIN_M = 0.3  # m around the house
+MIN_STEP_M = 0.02  # m: smaller steps add no points to a line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,18 +34,20 @@ def floor_map(plan: dict, journeys: Sequence[Journey], goals: Sequence[Sequence[
         goals: (x, y, yaw, ...) of the arrows.
     """
     x0, y0, x1, y1 = plan['bounds']
-    width, height = (x1 - x0 + 2 * MARGIN) * SCALE, (y1 - y0 + 2 * MARGIN) * SCALE
+    width = (x1 - x0 + 2 * MARGIN_M) * PIXELS_PER_M
+    height = (y1 - y0 + 2 * MARGIN_M) * PIXELS_PER_M
 
     def place(x, y):
-        return (x - x0 + MARGIN) * SCALE, height - (y - y0 + MARGIN) * SCALE
+        return (x - x0 + MARGIN_M) * PIXELS_PER_M, height - (y - y0 + MARGIN_M) * PIXELS_PER_M
 
     def line(points):
         return ' '.join(f'{px:.1f},{py:.1f}' for px, py in (place(x, y) for x, y in points))
 
     def rect(box, style):
         left, top = place(box[0], box[3])
-        return (f'<rect x="{left:.1f}" y="{top:.1f}" width="{(box[2] - box[0]) * SCALE:.1f}" '
-                f'height="{(box[3] - box[1]) * SCALE:.1f}" {style}/>')
+        return (f'<rect x="{left:.1f}" y="{top:.1f}" '
+                f'width="{(box[2] - box[0]) * PIXELS_PER_M:.1f}" '
+                f'height="{(box[3] - box[1]) * PIXELS_PER_M:.1f}" {style}/>')
 
     alone = len(journeys) == 1  # room for a broad line, its end and what it touched
     parts = [rect(plan['bounds'], 'fill="var(--floor)"')]
@@ -60,7 +62,7 @@ def floor_map(plan: dict, journeys: Sequence[Journey], goals: Sequence[Sequence[
         way = journey.trajectory[:, :2]
         if not len(way):
             continue
-        moved = np.hypot(*np.diff(way, axis=0, prepend=np.inf).T) > STILL
+        moved = np.hypot(*np.diff(way, axis=0, prepend=np.inf).T) > MIN_STEP_M
         colour = 'var(--good)' if journey.success else 'var(--bad)'
         (sx, sy), (ex, ey) = place(*way[0]), place(*way[-1])
         parts.append(f'<polyline points="{line(way[moved])}" fill="none" stroke="{colour}" '
@@ -79,6 +81,7 @@ def floor_map(plan: dict, journeys: Sequence[Journey], goals: Sequence[Sequence[
                    for r, turn in ((0.45, 0), (0.13, math.pi / 2), (0.13, -math.pi / 2))]
         px, py = place(x, y)
         parts.append(f'<polygon points="{line(corners)}" fill="var(--goal)"/><circle '
-                     f'cx="{px:.1f}" cy="{py:.1f}" r="{0.13 * SCALE:.1f}" fill="var(--goal)"/>')
+                     f'cx="{px:.1f}" cy="{py:.1f}" r="{0.13 * PIXELS_PER_M:.1f}" '
+                     'fill="var(--goal)"/>')
     return (f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="map with '
             f'journey{"s" * (len(journeys) != 1)}">{"".join(parts)}</svg>')

@@ -8,7 +8,7 @@ import html
 import cv2
 import numpy as np
 
-# Names of colours in pages and charts. The c0 to c7 tell curves apart, also without red and green.
+# Names of colours in pages and charts. c0 to c7 distinguish curves, also without red and green.
 LIGHT = {
     'ink': '#1d2430', 'soft': '#5c6675', 'line': '#d9dee6', 'paper': '#fbfbf9', 'card': '#ffffff',
     'good': '#11805a', 'bad': '#c4572c', 'wall': '#39424f', 'wood': '#e6ddcd', 'floor': '#f4f2ec',
@@ -83,7 +83,7 @@ def table(headings: list[str], rows: list[list[str]], *, text: int = 1,
     Args:
         headings: plain text.
         rows: HTML of the cells.
-        text: so many first columns hold words, the others numbers.
+        text: so many first columns hold text, the others numbers.
         first: whether the first row is the one that matters most.
     """
     def cells(tag: str, row: list[str]) -> str:

@@ -16,7 +16,7 @@ SPLITS = {  # names of splits, for people
     'train': 'Training split', 'validation': 'Validation split', 'test': 'Test split',
     'unseen_look': 'Unseen look',
 }
-Column = tuple[str, Callable[[dict], str]]  # heading, its words from a summary
+Column = tuple[str, Callable[[dict], str]]  # heading, its text from a summary
 COLUMNS: tuple[Column, ...] = (
     ('success (95 %)', lambda r: '{:.2f} ({:.2f}-{:.2f})'.format(r['success'],
                                                                  *r['success_interval'])),
@@ -48,7 +48,7 @@ def number(value: float | None, form: str) -> str:
 
 
 def place(split: str, scenes: Sequence[str], bag: str | None = None) -> str:
-    """A split and its scenes, or the recorded drive, in a few words."""
+    """A split and its scenes, or the recorded drive, in short."""
     if bag is not None:
         return f'{SPLITS[split].lower()} of {bag}'
     if len(scenes) <= 3:
@@ -64,25 +64,25 @@ def _columns(stop: str, rows: Iterable[dict]) -> tuple[Column, ...]:
 def _rows_cells(rows: dict[str, dict], stop: str) -> tuple[list[str], list[list[str]]]:
     columns = _columns(stop, rows.values())
     return (['policy', *(heading for heading, _ in columns)],
-            [[name, *(words(figures) for _, words in columns)] for name, figures in rows.items()])
+            [[name, *(text(figures) for _, text in columns)] for name, figures in rows.items()])
 
 
 def _scenes_cells(scenes: dict, stop: str) -> tuple[list[str], list[list[str]]]:
-    """A line a scene: the policy's figures, and beside them the success of each control."""
+    """A line a scene: the policy's figures, and next to them the success of each control."""
     columns = _columns(stop, (row for rows in scenes.values() for row in rows[stop].values()))
     names = list(next(iter(scenes.values()))[stop])
     lines = []
     for scene, rows in scenes.items():
         own, *controls = rows[stop].values()
-        lines.append([scene, str(own['episodes']), *(words(own) for _, words in columns),
+        lines.append([scene, str(own['episodes']), *(text(own) for _, text in columns),
                       *(f'{control["success"]:.2f}' for control in controls)])
     return ['scene', 'episodes', *(heading for heading, _ in columns), *names[1:]], lines
 
 
 def row_line(name: str, figures: dict, stop: str) -> str:
     """A row in a line, as soon as it is measured."""
-    words = [f'{heading} {shown(figures)}' for heading, shown in _columns(stop, [figures])]
-    return f'{name}: {figures["episodes"]} episodes, {", ".join(words)}'
+    texts = [f'{heading} {shown(figures)}' for heading, shown in _columns(stop, [figures])]
+    return f'{name}: {figures["episodes"]} episodes, {", ".join(texts)}'
 
 
 def print_rows(figures: dict[str, dict[str, dict]], title: str) -> None:

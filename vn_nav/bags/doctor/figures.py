@@ -10,11 +10,12 @@ import statistics
 
 import numpy as np
 
-from vn_nav.bags.drive import COMMAND_TIMEOUT_S
+from vn_nav.bags.poses import COMMAND_TIMEOUT_S
 from vn_nav.bags.stamped import PAIRING_TIMEOUT_S
 from vn_nav.bags.storage.stream import Connection
 
 ERROR, WARNING = 'error', 'warning'
+DRIVER = 'check the driver, and record again'  # a remedy
 MEDIAN_SAMPLES = 4096  # numbers that a median is taken of, at most
 # A clock that goes back by this much was set back, see `set_back`.
 SET_BACK_NS = round(1e9 * PAIRING_TIMEOUT_S)
@@ -53,6 +54,30 @@ class Finding:
     when: float | None  # s since the bag's first message, the first time; None: all the time
     remedy: str
     count: int = 1
+
+
+class Findings:
+    """Findings of a bag; `start` [ns] is what their times count from."""
+
+    def __init__(self):
+        self.start: int | None = None
+        self._found: dict[tuple[str, str], Finding] = {}
+
+    def add(self, severity: str, topic: str, key: str, what: str, at: int | None, remedy: str,
+            count: int = 1) -> None:
+        """Note a finding; of the same `key` only the first is kept, and how many there are."""
+        finding = self._found.get((topic, key))
+        if finding is None:
+            when = None if at is None else (at - (self.start or at)) * 1e-9
+            self._found[topic, key] = Finding(severity, topic, what, when, remedy, count)
+        else:
+            finding.count += count
+
+    def sorted(self) -> list[Finding]:
+        """All of them, the worst first."""
+        order = {ERROR: 0, WARNING: 1}
+        return sorted(self._found.values(), key=lambda f: (
+            order[f.severity], -1.0 if f.when is None else f.when))
 
 
 @dataclasses.dataclass
@@ -141,7 +166,7 @@ class SetBack:
             self.first, self.at = step, at
 
 
-class HeardTopic:
+class ReceivedTopic:
     """A topic as it comes by."""
 
     def __init__(self, connection: Connection, role: str | None):
@@ -170,12 +195,12 @@ class Motion:
     """How far the robot has gone, m and rad added: `total`, and `reach` from where it began."""
 
     def __init__(self):
-        self.total, self.reach, self.heard = 0.0, 0.0, 0
+        self.total, self.reach, self.poses = 0.0, 0.0, 0
         self._first: np.ndarray | None = None
         self._last: np.ndarray | None = None
 
     def pose(self, values: np.ndarray) -> None:
-        self.heard += 1
+        self.poses += 1
         if self._first is None or self._last is None:
             self._first = self._last = values[:3]
         self.reach = max(self.reach, _distance(self._first, values))
@@ -197,7 +222,7 @@ class Command:
         self.total = 0.0
         self._speed, self._since = 0.0, 0
 
-    def hear(self, velocity: np.ndarray, at: int) -> None:
+    def add(self, velocity: np.ndarray, at: int) -> None:
         seconds = min(max((at - self._since) * 1e-9, 0.0), COMMAND_TIMEOUT_S)
         self.total += self._speed * seconds
         self._speed, self._since = float(np.abs(velocity[:3]).sum()), at

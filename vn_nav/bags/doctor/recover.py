@@ -37,7 +37,7 @@ class Recovered:
         return bool(self.missing or self.surplus) or any(not loss.harmless for loss in self.losses)
 
     def lines(self) -> list[str]:
-        """The account in words, a line each."""
+        """Summary lines of the account."""
         seconds = (self.span[1] - self.span[0]) * 1e-9
         return [f'{self.target}: {sum(self.counts.values())} messages of {len(self.counts)} '
                 f'topics, {seconds:.1f} s', *(f'note: {note}' for note in self.notes),

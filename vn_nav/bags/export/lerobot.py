@@ -8,13 +8,11 @@ what odometry says then, and the action is what was commanded from then until th
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,49 +23,35 @@ from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav import __version__
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.drive import (
-    COMMAND_TIMEOUT_S,
     Frame,
     Report,
     TimestampedMessage,
     find_topics,
-    hear,
     synchronise,
+    timestamped_messages,
+)
+from vn_nav.bags.export.lerobot_files import Table, Video
+from vn_nav.bags.export.lerobot_layout import (
+    ACTION,
+    ACTIONS,
+    CAMERA,
+    CARD,
+    DRIVE,
+    FILE,
+    FIRST,
+    NUMBERS,
+    STATE,
+    STATES,
+    TO_GOAL,
+    VERSION,
+    tasks_table,
 )
 from vn_nav.bags.export.lerobot_stats import Colours, describe, merge
+from vn_nav.bags.export.received_velocities import ReceivedVelocities
 from vn_nav.bags.roles import Topics
-from vn_nav.bags.stamped import set_back
 from vn_nav.errors import UserError
 
-VERSION = 'v3.0'
-CAMERA, STATE, ACTION = 'observation.images.camera', 'observation.state', 'action'
-STATES = ('x', 'y', 'yaw', 'vx', 'vy', 'wz')  # m, rad; m/s, rad/s in the robot's frame
-ACTIONS = ('vx', 'vy', 'wz')  # m/s, rad/s
-TO_GOAL, DRIVE = 'drive to where the goal picture was taken', 'drive'
-FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
-FIRST = FILE.format(chunk_index=0, file_index=0)
-NUMBERS = {'timestamp': 'float32', 'frame_index': 'int64', 'episode_index': 'int64',
-           'index': 'int64', 'task_index': 'int64'}
 MAX_FPS = 120  # frames a second
-# Velocities that wait for their picture: minutes at any rate.
-MAX_WAITING_VELOCITIES = 65_536
-
-
-CARD = """---
-tags:
-- LeRobot
-configs:
-- config_name: default
-  data_files: data/*/*.parquet
----
-
-A drive of a mobile robot, exported from the ROS 2 bag `{bag}` by vn_nav {version} at {fps} Hz,
-in LeRobot's format 3.0.
-
-- `observation.images.camera`: the picture nearest to the instant.
-- `observation.state`: x, y [m], yaw [rad] by {posed}; vx, vy [m/s], wz [rad/s] in the
-  robot's frame (x forward, y left).
-- `action`: mean vx, vy [m/s], wz [rad/s] from this instant until the next, as {acted}.
-"""
 
 
 class Row(NamedTuple):
@@ -93,7 +77,7 @@ def export(bag: str | Path, out: str | Path, *, topics: Topics, robot: str, fps:
         fps: frames a second of the dataset.
 
     Returns:
-        What was written, in words.
+        A summary line of what was written.
 
     Raises:
         UserError: packages that are not installed, a rate out of range, a folder that exists, no
@@ -110,14 +94,14 @@ def export(bag: str | Path, out: str | Path, *, topics: Topics, robot: str, fps:
     temporary = out.absolute().with_name(f'.{out.name}.{os.getpid()}.tmp')
     try:
         temporary.mkdir(parents=True)
-        said = _Dataset(temporary, fps, robot, names).write(bag)
+        summary = _Dataset(temporary, fps, robot, names).write(bag)
         temporary.rename(out)
     except OSError as error:
         raise UserError('a dataset can be written', f'{error.filename or out}: {error.strerror}',
                         'free some space, or choose another folder') from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    return f'{out}: {said}'
+    return f'{out}: {summary}'
 
 
 def _need_packages() -> None:
@@ -127,63 +111,6 @@ def _need_packages() -> None:
     except ImportError as error:
         raise UserError('datasets for LeRobot are written by the packages av and pyarrow',
                         str(error), 'pip install "vn_nav[lerobot]"') from error
-
-
-class _Velocities:
-    """Received velocities, until they are no longer needed."""
-
-    def __init__(self):
-        # Rows come later than velocities: two runs, where a clock was set back in between.
-        self._runs: list[collections.deque[tuple[float, np.ndarray]]] = [
-            collections.deque(maxlen=MAX_WAITING_VELOCITIES)]
-
-    def hear(self, at: float, velocity: np.ndarray) -> None:
-        run = self._runs[-1]
-        if run and set_back(at, run[-1][0]):
-            self._runs = [run, collections.deque(maxlen=MAX_WAITING_VELOCITIES)]
-            run = self._runs[-1]
-        if not run or at > run[-1][0]:
-            run.append((at, velocity))
-
-    def _run(self, at: float) -> collections.deque[tuple[float, np.ndarray]]:
-        """The run that a time lies in, or next to."""
-        return min(self._runs, key=lambda run: max(
-            run[0][0] - at, at - run[-1][0], 0.0) if run else np.inf)
-
-    def forget(self, before: float) -> None:
-        """Drop what is older than the last one at or before a time."""
-        run = self._run(before)
-        while len(run) > 1 and run[1][0] <= before:
-            run.popleft()
-        if run is self._runs[-1]:
-            self._runs = [run]
-
-    def near(self, at: float) -> np.ndarray:
-        """The one nearest to a time, [3]; zero where there is none."""
-        run = self._run(at)
-        after = next((entry for entry in run if entry[0] >= at), None)
-        before = next((entry for entry in reversed(run) if entry[0] <= at), None)
-        both = [entry for entry in (before, after) if entry is not None]
-        return (min(both, key=lambda entry: abs(entry[0] - at))[1] if both else np.zeros(3))
-
-    def mean(self, begin: float, end: float) -> np.ndarray:
-        """Of velocities that hold until the next one, or for `COMMAND_TIMEOUT_S` s.
-
-        Args:
-            begin: s.
-            end: s; `begin` for what holds then.
-
-        Returns:
-            [3] vx, vy [m/s], wz [rad/s].
-        """
-        end = max(end, begin + 1e-3)  # times since 1970 are told apart to 2e-7 s
-        span, total = end - begin, np.zeros(3)
-        entries = [entry for entry in self._run(begin) if entry[0] < end]
-        for k, (at, velocity) in enumerate(entries):
-            until = entries[k + 1][0] if k + 1 < len(entries) else np.inf
-            until = min(until, at + COMMAND_TIMEOUT_S, end)
-            total += velocity * max(until - max(at, begin), 0.0) / span
-        return total
 
 
 class _Dataset:
@@ -198,8 +125,8 @@ class _Dataset:
 
     def __init__(self, folder: Path, fps: int, robot: str, topics: Topics):
         self._folder, self._fps, self._robot, self._topics = folder, fps, robot, topics
-        self._commands, self._odometry = _Velocities(), _Velocities()
-        self._video, self._table = _Video(folder, fps), _Table(folder)
+        self._commands, self._odometry = ReceivedVelocities(), ReceivedVelocities()
+        self._video, self._table = Video(folder, fps), Table(folder)
         self._states: list[np.ndarray] = []  # of the episode
         self._actions: list[np.ndarray] = []
         self._colours = Colours()
@@ -209,10 +136,10 @@ class _Dataset:
         self._tasks: list[str] = []
 
     def write(self, bag: str | Path) -> str:
-        """Everything; what it was, in words."""
+        """Write everything; a summary line of it."""
         report, before = Report(), None
         with self._video, self._table:
-            for row in self._grid(synchronise(self._heard(bag), self._topics, report)):
+            for row in self._grid(synchronise(self._messages(bag), self._topics, report)):
                 if before is not None:
                     self._add(before, row)
                 before = row
@@ -232,14 +159,14 @@ class _Dataset:
     def _acted(self) -> str:
         return 'commanded' if self._topics.command else 'measured (no commands were recorded)'
 
-    def _heard(self, bag: str | Path) -> Iterator[TimestampedMessage]:
-        for m in hear(bag, self._topics):
+    def _messages(self, bag: str | Path) -> Iterator[TimestampedMessage]:
+        for m in timestamped_messages(bag, self._topics):
             try:
                 if m.topic == self._topics.command:
-                    self._commands.hear(m.time, twist_to_array(m.message)[:3])
+                    self._commands.add(m.time, twist_to_array(m.message)[:3])
                 elif m.topic == self._topics.odometry:
                     values = odometry_to_array(m.message)
-                    self._odometry.hear(values[6] or m.time, values[3:6])
+                    self._odometry.add(values[6] or m.time, values[3:6])
             except MotionError:
                 pass  # as good as not sent
             yield m
@@ -338,7 +265,7 @@ class _Dataset:
                  for name in dict.fromkeys(names)}
         pyarrow.parquet.write_table(pyarrow.Table.from_pylist(self._episodes),
                                     meta / 'episodes' / f'{FIRST}.parquet')
-        pyarrow.parquet.write_table(_tasks_table(self._tasks), meta / 'tasks.parquet')
+        pyarrow.parquet.write_table(tasks_table(self._tasks), meta / 'tasks.parquet')
         (meta / 'stats.json').write_text(json.dumps(stats, indent=4))
         (meta / 'info.json').write_text(json.dumps(self._info(), indent=4))
         (self._folder / 'README.md').write_text(CARD.format(
@@ -367,106 +294,3 @@ class _Dataset:
             'splits': {'train': f'0:{len(self._episodes)}'},
             'data_path': f'data/{FILE}.parquet', 'video_path': f'videos/{{video_key}}/{FILE}.mp4',
             'features': features}
-
-
-class _Video:
-    """The camera's video: H.264, every second picture whole, so that any can be read soon.
-
-    Attributes:
-        size: height, width [pixels]; None before the first picture.
-    """
-
-    def __init__(self, folder: Path, fps: int):
-        self._path, self._fps = folder / 'videos' / CAMERA / f'{FIRST}.mp4', fps
-        self.size: tuple[int, int] | None = None
-        self._file: Any = None
-        self._count = 0
-
-    def __enter__(self) -> _Video:
-        return self
-
-    def add(self, picture: np.ndarray) -> None:
-        """Append a picture [H,W,3] uint8 RGB.
-
-        Raises:
-            UserError: it has another size than the first.
-        """
-        import av
-        # 4:2:0 has even sides: an odd row or column is left out.
-        height, width = (side - side % 2 for side in picture.shape[:2])
-        size = self.size or self._begin(height, width)
-        if (height, width) != size:
-            raise UserError('pictures of a dataset have one size', f'{width} x {height} after '
-                            f'{size[1]} x {size[0]}', 'split the bag where the camera '
-                            'changes')
-        frame = av.VideoFrame.from_ndarray(
-            np.ascontiguousarray(picture[:height, :width]), format='rgb24')
-        frame.pts, frame.time_base = self._count, Fraction(1, self._fps)
-        self._count += 1
-        self._file.mux(self._stream.encode(frame))
-
-    def _begin(self, height: int, width: int) -> tuple[int, int]:
-        import av
-        if not (height and width):
-            raise UserError('a video has two rows and columns at least', f'{width} x {height}',
-                            'export a camera with larger pictures')
-        self._path.parent.mkdir(parents=True)
-        self.size = height, width
-        self._file = av.open(str(self._path), 'w')
-        self._stream = self._file.add_stream('libx264', rate=self._fps, options={
-            'g': '2', 'bf': '0', 'crf': '20', 'preset': 'veryfast'})
-        self._stream.height, self._stream.width = height, width
-        self._stream.pix_fmt = 'yuv420p'
-        return self.size
-
-    def __exit__(self, *error) -> None:
-        if self._file is None:
-            return
-        try:
-            if error[0] is None:
-                self._file.mux(self._stream.encode())
-        finally:
-            self._file.close()
-
-
-class _Table:
-    """The numbers of all rows, an episode at a time."""
-
-    def __init__(self, folder: Path):
-        self._path = folder / 'data' / f'{FIRST}.parquet'
-        self._file: Any = None  # a ParquetWriter; pyarrow has no types
-
-    def __enter__(self) -> _Table:
-        return self
-
-    def add(self, columns: dict[str, np.ndarray]) -> None:
-        """Append an episode: columns [K] or [K,D]."""
-        import pyarrow
-        import pyarrow.parquet
-        arrays = {}
-        for name, values in columns.items():
-            flat = pyarrow.array(values.ravel())
-            arrays[name] = (flat if values.ndim == 1 else
-                            pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1]))
-        table = pyarrow.table(arrays)
-        if self._file is None:
-            self._path.parent.mkdir(parents=True)
-            self._file = pyarrow.parquet.ParquetWriter(self._path, table.schema)
-        self._file.write_table(table)
-
-    def __exit__(self, *error) -> None:
-        if self._file is not None:
-            self._file.close()
-
-
-def _tasks_table(tasks: list[str]):
-    """Tasks as pandas reads them: the text is the index, as the metadata states."""
-    import pyarrow
-    columns = [{'name': name, 'field_name': name, 'pandas_type': kind, 'numpy_type': numpy,
-                'metadata': None} for name, kind, numpy in (
-                    ('task_index', 'int64', 'int64'), ('task', 'unicode', 'object'))]
-    told = {'index_columns': ['task'], 'column_indexes': [], 'columns': columns,
-            'creator': {'library': 'pyarrow', 'version': pyarrow.__version__},
-            'pandas_version': None}
-    table = pyarrow.table({'task_index': np.arange(len(tasks)), 'task': tasks})
-    return table.replace_schema_metadata({'pandas': json.dumps(told)})

@@ -13,11 +13,11 @@ import numpy as np
 from vn_nav.bags.continuity import Break, divide, find_breaks
 from vn_nav.bags.dataset import DriveSet
 from vn_nav.bags.mapping.loop_closure import OptimisedOdometry
-from vn_nav.bags.mapping.pose_graph import GATE
+from vn_nav.bags.mapping.pose_graph import MAX_CHI2
 from vn_nav.errors import UserError
 
 RANGES = re.compile(r'\d+-\d+(,\d+-\d+)*')
-LISTED = 6  # stretches in an error, at most
+MAX_LISTED_STRETCHES = 6  # stretches in an error, at most
 RULE = 'place recognition is learned from a drive in one frame, or from stretches of one place'
 
 
@@ -131,7 +131,7 @@ def check_place(part: Part, found: OptimisedOdometry) -> None:
             reasons.insert(found.stretch[k], 'from here on no picture matches the earlier '
                            'pictures at the same poses')
         _refuse(part, found.stretch, found.place, reasons, '')
-    if found.facts['strain'] > GATE:
+    if found.facts['strain'] > MAX_CHI2:
         k = found.facts['strained']
         raise UserError(
             'odometry agrees with the loop closures', f'they contradict each other after '
@@ -142,22 +142,23 @@ def check_place(part: Part, found: OptimisedOdometry) -> None:
 
 def _refuse(part: Part, stretch: np.ndarray, place: np.ndarray, reasons: Sequence[str],
             remedy: str) -> None:
-    ranges, words = [], []
+    ranges, listed = [], []
     for number in range(int(stretch.max()) + 1):
         own = np.flatnonzero(stretch == number)
         ranges.append(f'{part.rows[own[0]] + 1}-{part.rows[own[-1]] + 1}')
         why = f', because {reasons[number]}' if reasons[number] else ''
-        words.append(f'{ranges[-1]} ({_clock(part, own[0])} to {_clock(part, own[-1])}{why})')
-    more = f' and {len(words) - LISTED} more' if len(words) > LISTED else ''
+        listed.append(f'{ranges[-1]} ({_clock(part, own[0])} to {_clock(part, own[-1])}{why})')
+    unlisted = len(listed) - MAX_LISTED_STRETCHES
+    more = f' and {unlisted} more' if unlisted > 0 else ''
     places = int(place.max()) + 1
     named = [','.join(r for r, p in zip(ranges, place, strict=True) if p == number)
              for number in range(places)]
     longest = max(named, key=lambda text: sum(b - a for a, b in parse_pictures(text)))
     raise UserError(
         RULE, f'{places} that have nothing in common: pictures '
-        f'{"; ".join(words[:LISTED])}{more}', f'learn one place with --pictures {longest}, or, '
-        f'if you know that all are in one frame, name them all: --pictures {",".join(ranges)}'
-        f'{remedy}')
+        f'{"; ".join(listed[:MAX_LISTED_STRETCHES])}{more}',
+        f'learn one place with --pictures {longest}, or, if you know that all are in one frame, '
+        f'name them all: --pictures {",".join(ranges)}{remedy}')
 
 
 def _clock(part: Part, k: int) -> str:

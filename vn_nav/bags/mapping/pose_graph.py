@@ -15,10 +15,10 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 
-GATE = 16.3  # chi^2 of a measurement, 3 degrees of freedom, 99.9 %
-WAYS, TURNS = 0.02, 0.01  # standard deviations of the shares of odometry
-ODOMETRY = np.array([[1, 0, 0], [1, 0, 0], [0, 1.0, 0]])  # which share acts on x, y and yaw
-CLOSURES = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])
+MAX_CHI2 = 16.3  # chi^2 of a measurement, 3 degrees of freedom, 99.9 %
+WAY_SHARE_SIGMA, TURN_SHARE_SIGMA = 0.02, 0.01  # standard deviations of the shares of odometry
+ODOMETRY_SHARES = np.array([[1, 0, 0], [1, 0, 0], [0, 1.0, 0]])  # which share acts on x, y and yaw
+CLOSURE_SHARES = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])
 FIRST_POSE_INFORMATION = 1e9  # information that holds the first pose
 MIN_STEP = 1e-4  # m or rad: steps below end the search
 
@@ -79,17 +79,17 @@ def solve(poses: np.ndarray, odometry: Edges, closures: Edges, scale: float = 0.
         scale: standard deviation of the share of closures.
         shares: [3] to begin with.
     """
-    prior = np.array([WAYS, TURNS, scale])**-2.0
+    prior = np.array([WAY_SHARE_SIGMA, TURN_SHARE_SIGMA, scale])**-2.0
     poses, shares = poses.copy(), np.zeros(3) if shares is None else shares.copy()
-    chi = _errors(poses, closures, CLOSURES @ shares)[1]
-    wide = max(1.0, 2 * float(chi.max(initial=0.0)) / GATE)
+    chi = _errors(poses, closures, CLOSURE_SHARES @ shares)[1]
+    wide = max(1.0, 2 * float(chi.max(initial=0.0)) / MAX_CHI2)
     for _ in range(60):
-        weight = (wide * GATE / (wide * GATE + chi))**2
+        weight = (wide * MAX_CHI2 / (wide * MAX_CHI2 + chi))**2
         information, slope = _equations(poses, shares, prior, odometry, closures, weight)
         step = np.linalg.solve(information, slope)
         poses = poses + step[:-3].reshape(-1, 3)
         shares = shares + step[-3:]
-        chi = _errors(poses, closures, CLOSURES @ shares)[1]
+        chi = _errors(poses, closures, CLOSURE_SHARES @ shares)[1]
         if wide == 1.0 and np.abs(step).max() < MIN_STEP:
             break
         wide = max(1.0, wide / 1.6)
@@ -98,8 +98,8 @@ def solve(poses: np.ndarray, odometry: Edges, closures: Edges, scale: float = 0.
 
 
 def misfit(poses: np.ndarray, odometry: Edges, shares: np.ndarray) -> np.ndarray:
-    """Chi^2 [E] that poses leave of odometry: what they contradict is far above `GATE`."""
-    return _errors(poses, odometry, ODOMETRY @ shares)[1]
+    """Chi^2 [E] that poses leave of odometry: what they contradict is far above `MAX_CHI2`."""
+    return _errors(poses, odometry, ODOMETRY_SHARES @ shares)[1]
 
 
 def relative(solution: Solution, covariance: np.ndarray, edges: Edges
@@ -111,7 +111,7 @@ def relative(solution: Solution, covariance: np.ndarray, edges: Edges
         covariance: as `Solution.covariance` gives it.
         edges: the measurements.
     """
-    error, _, one, other, _ = _errors(solution.poses, edges, CLOSURES @ solution.shares,
+    error, _, one, other, _ = _errors(solution.poses, edges, CLOSURE_SHARES @ solution.shares,
                                       lean=False)
     a, b = edges.first, edges.second
     cross = one @ covariance[a, :, b] @ other.transpose(0, 2, 1)
@@ -157,10 +157,10 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
     """Normal equations of a step."""
     size = 3 * len(poses)
     blocks, slope = np.zeros((len(poses), 3, len(poses), 3)), np.zeros((len(poses), 3))
-    beside, down = np.zeros((len(poses), 3, 3)), np.zeros(size + 3)
+    shared, down = np.zeros((len(poses), 3, 3)), np.zeros(size + 3)
     information = np.zeros((size + 3, size + 3))
-    for edges, acts, trust in ((odometry, ODOMETRY, 1.0),
-                               (closures, CLOSURES, weight[:, None, None])):
+    for edges, acts, trust in ((odometry, ODOMETRY_SHARES, 1.0),
+                               (closures, CLOSURE_SHARES, weight[:, None, None])):
         error, _, one, other, seen = _errors(poses, edges, acts @ shares, lean=False)
         inverse = trust * np.linalg.inv(edges.covariance)
         by_shares = seen[:, :, None] * acts
@@ -168,7 +168,7 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
         for node, by in sides:
             left = by.transpose(0, 2, 1) @ inverse
             np.add.at(slope, node, -(left @ error[..., None])[..., 0])
-            np.add.at(beside, node, left @ by_shares)
+            np.add.at(shared, node, left @ by_shares)
             for node2, by2 in sides:
                 # NumPy's annotations know no slice among the indices of `at`.
                 np.add.at(blocks, (node, slice(None), node2),  # type: ignore[arg-type]
@@ -178,7 +178,7 @@ def _equations(poses, shares, prior, odometry: Edges, closures: Edges, weight: n
         information[size:, size:] += (left @ by_shares).sum(axis=0)
     blocks[0, :, 0] += FIRST_POSE_INFORMATION * np.eye(3)
     information[:size, :size] = blocks.reshape(size, size)
-    information[:size, size:] = beside.reshape(size, 3)
+    information[:size, size:] = shared.reshape(size, 3)
     information[size:, :size] = information[:size, size:].T
     information[size:, size:] += np.diag(prior)
     down[:size] = slope.reshape(-1)

@@ -11,16 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted, load_drives
+from vn_nav.bags.dataset import MAX_DEPTH, DriveSet, Wanted
 from vn_nav.bags.drive import RECORDED
-from vn_nav.bags.mapping.loop_closure import ROUNDS, straighten
+from vn_nav.bags.drive_cache import load_drives
+from vn_nav.bags.mapping.loop_closure import ROUND_FACTORS, optimise_odometry
 from vn_nav.bags.mapping.one_place import Part, check_frame, check_place, choose, parse_pictures
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.storage.stream import messages
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 
-GOALS, LEAST_GOALS = 1000, 4
+MAX_GOALS, MIN_GOALS = 1000, 4
 PLACE_PICTURE_PX = 128  # pixels a side of the pictures that places are recognised by
 
 
@@ -33,15 +34,15 @@ class PlaceOptions:
     """
 
     topics: Topics = Topics()  # names in the bag
-    margin: float | None = None  # m beside the driven path that counts as free; None: 0.3
-    straighten: bool = True  # correct odometry by the places that the drive shows twice
+    margin: float | None = None  # m around the driven path that counts as free; None: 0.3
+    loop_closure: bool = True  # correct odometry by the places that the drive shows twice
     # Numbers of the pictures to learn from, 'A-B[,C-D]'; several ranges: the caller vouches for
     # their odometry being in one frame. Empty: all that are of one place.
     pictures: str = ''
-    goals: int = GOALS  # pictures to drive to, at most
+    goals: int = MAX_GOALS  # pictures to drive to, at most
 
     def __post_init__(self):
-        if self.goals < LEAST_GOALS:
+        if self.goals < MIN_GOALS:
             raise UserError('there are at least four goals', self.goals, 'raise --goals')
         if self.pictures:
             parse_pictures(self.pictures)
@@ -51,7 +52,7 @@ def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: R
                size: int, cache: Path,
                show: Callable[[str, float], None] = lambda stage, share: None,
                until: float = math.inf) -> Any:
-    """The place out of a bag, and words about it on standard output.
+    """The place out of a bag; a summary of it goes to standard output.
 
     Args:
         bag: the drive.
@@ -61,7 +62,7 @@ def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: R
         size: side of the pictures [pixels].
         cache: folder of decoded bags.
         show: receives the current step and its share done.
-        until: see `loops.straighten`.
+        until: see `loop_closure.optimise_odometry`.
 
     Raises:
         UserError: a bag without what is needed; a drive too short, of one spot, or of several
@@ -85,11 +86,11 @@ def read_place(bag: Path, options: PlaceOptions, build_graph: Callable, robot: R
               + (f': {options.pictures}' if options.pictures else ''), flush=True)
     margin = {} if options.margin is None else {'margin': options.margin}
     stretch = part.stretch
-    if options.straighten:
-        # Larger pictures than the network's tell more exactly where they were taken.
+    if options.loop_closure:
+        # Larger pictures than the network's show more exactly where they were taken.
         large = load(PLACE_PICTURE_PX) if size < PLACE_PICTURE_PX else drives
-        found = straighten(part.of(large), robot, stretch=stretch, until=until,
-                           show=lambda share: show('places seen again', share))
+        found = optimise_odometry(part.of(large), robot, stretch=stretch, until=until,
+                                  show=lambda share: show('places seen again', share))
         check_place(part, found)
         _say(found.facts, len(part.reasons), part.vouched)
         poses = found.poses
@@ -122,9 +123,9 @@ def _say(facts: dict, stretches: int, vouched: bool) -> None:
               f'{math.degrees(facts["turned"]):.0f} deg', flush=True)
     else:
         print('odometry is not corrected: too few loop closures', flush=True)
-    if facts['rounds'] < len(ROUNDS):
+    if facts['rounds'] < len(ROUND_FACTORS):
         print(f'the search for loop closures ended after round {facts["rounds"]} of '
-              f'{len(ROUNDS)}: time limit', flush=True)
+              f'{len(ROUND_FACTORS)}: time limit', flush=True)
 
 
 def scene_of(bag: Path) -> dict:

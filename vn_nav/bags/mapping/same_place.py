@@ -1,7 +1,7 @@
 """Which stretches of a drive show one place, and where a drive changes its place unnoticed.
 
-Pictures decide: stretches belong together if enough closures (`loops`) lead from one to the other.
-And where odometry says again and again that the robot stands where it stood before, but no picture
+Pictures decide: stretches belong together if enough loop closures lead from one to the other. And
+where odometry says again and again that the robot stands where it stood before, but no picture
 ever looks as it did then, the robot was carried, or another drive begins.
 """
 

@@ -2,7 +2,7 @@
 
 The robot drives on a floor and its camera is level but for a known pitch, so three numbers relate
 two pictures: where the second robot stands, seen by the first, and where it looks. A point of the
-first picture is a direction and a depth, which a depth picture tells, or else only what is common
+first picture is a direction and a depth, which a depth picture gives, or else only what is common
 indoors: then the length of a motion is hardly known, its direction and the heading are.
 """
 
@@ -18,20 +18,22 @@ import numpy as np
 from vn_nav.arrival import wrap_angle
 from vn_nav.robot import RobotSpec
 
-FEATURES = 250  # of a picture at most
-RATIO = 0.85  # of the distances to the best and the second best match
-PIXELS = 0.6  # px, standard deviation of a match
-CAMERA = 0.03  # share by which the focal length may be wrong
-COMMON = (math.log(1.8), 0.7)  # distances ahead indoors [m]: mean and deviation of the logarithm
+MAX_FEATURES = 250  # of a picture at most
+MAX_MATCH_RATIO = 0.85  # of the distances to the best and the second best match
+MATCH_SIGMA_PX = 0.6  # px, standard deviation of a match
+FOCAL_SIGMA_SHARE = 0.03  # share by which the focal length may be wrong
+# Of the logarithm of distances ahead indoors [m]: mean and standard deviation.
+LOG_DEPTH_MEAN_SIGMA = (math.log(1.8), 0.7)
 # Share by which a motion may be too long or short, because all depths of a picture may be: without
 # and with a depth picture.
-SCALE, DEPTH_SCALE = 0.4, 0.05
+SCALE_SIGMA_SHARE, DEPTH_SCALE_SIGMA_SHARE = 0.4, 0.05
 # The search: steps of the heading, bearings in a circle, and how far a match may lie off.
-HEADING, BEARINGS, OFF = math.radians(2), 24, 2.5  # rad, 1, px
-NEAREST = 2.0  # motion as a share of a point's depth, at most
-FEWEST = 8  # matches to look for a motion in
-GATE = 9.21  # chi^2 of a match, 2 degrees of freedom, 99 %
-WIDTHS = GATE * np.maximum(1.0, 6.0 / 1.6**np.arange(12))  # of the kernel, step by step
+HEADING_STEP_RAD, BEARINGS, MAX_MATCH_ERROR_PX = math.radians(2), 24, 2.5  # rad, 1, px
+MAX_MOTION_DEPTH_SHARE = 2.0  # motion as a share of a point's depth, at most
+MIN_PUTATIVE_MATCHES = 8  # matches to look for a motion in
+MAX_MATCH_CHI2 = 9.21  # chi^2 of a match, 2 degrees of freedom, 99 %
+# Of the kernel, step by step.
+KERNEL_WIDTHS_CHI2 = MAX_MATCH_CHI2 * np.maximum(1.0, 6.0 / 1.6**np.arange(12))
 
 
 class Features(NamedTuple):
@@ -61,7 +63,7 @@ class Camera:
         self._pitch = robot.camera_pitch
         # OpenCV's annotations lack the name that every release has.
         self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]
-            nfeatures=FEATURES, contrastThreshold=0.02)
+            nfeatures=MAX_FEATURES, contrastThreshold=0.02)
 
     def look(self, picture: np.ndarray, depth: np.ndarray | None = None) -> Features:
         """Features of a picture.
@@ -72,7 +74,7 @@ class Camera:
         """
         grey = cv2.cvtColor(np.ascontiguousarray(picture.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY)
         points, found = self._sift.detectAndCompute(grey, None)
-        scale = SCALE if depth is None else DEPTH_SCALE
+        scale = SCALE_SIGMA_SHARE if depth is None else DEPTH_SCALE_SIGMA_SHARE
         if not points:
             return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 2)),
                             scale)
@@ -80,7 +82,7 @@ class Camera:
         left, up = ((self._middle - at) / self._focal).T
         c, s = math.cos(self._pitch), math.sin(self._pitch)
         ahead = c + s * up
-        known = np.tile(COMMON, (len(at), 1))
+        known = np.tile(LOG_DEPTH_MEAN_SIGMA, (len(at), 1))
         if depth is not None:
             cell = ((at + 0.5) * (len(depth) / (2 * self._middle + 1))).astype(int)
             cell = np.clip(cell, 0, len(depth) - 1)
@@ -103,7 +105,7 @@ class Camera:
             place, heading: by how much it may be another [m], [rad]; standard deviations.
         """
         pairs = match(one.descriptor, other.descriptor)
-        if len(pairs) < FEWEST:
+        if len(pairs) < MIN_PUTATIVE_MATCHES:
             return None
         return relate(one.slope[pairs[:, 0]], other.slope[pairs[:, 1]], one.depth[pairs[:, 0]],
                       self._focal, expected, place, heading)
@@ -122,21 +124,22 @@ def relate(first: np.ndarray, second: np.ndarray, depth: np.ndarray, focal: floa
         focal: length [pixels], for the noise.
         expected, place, heading: as in `Camera.relate`.
     """
-    reach = 3 * heading + HEADING
-    yaws = expected[2] + np.arange(-reach, reach + HEADING, HEADING)
-    motion = _search(first, second, depth, yaws, BEARINGS, OFF / focal, expected, place, heading)
+    reach = 3 * heading + HEADING_STEP_RAD
+    yaws = expected[2] + np.arange(-reach, reach + HEADING_STEP_RAD, HEADING_STEP_RAD)
+    motion = _search(first, second, depth, yaws, BEARINGS, MAX_MATCH_ERROR_PX / focal, expected,
+                     place, heading)
     now = depth.copy()
     chi, normal, occam = np.zeros(len(first)), np.zeros((3, 4)), np.zeros((3, 4))
-    for wide in WIDTHS:  # Gauss and Newton; matches weigh by a kernel that narrows
-        _equations(first, second, depth, now, (PIXELS / focal)**2, motion, wide, chi, normal,
-                   occam)
+    for wide in KERNEL_WIDTHS_CHI2:  # Gauss and Newton; matches weigh by a kernel that narrows
+        _equations(first, second, depth, now, (MATCH_SIGMA_PX / focal)**2, motion, wide, chi,
+                   normal, occam)
         information = normal[:, :3] + 1e-6 * np.eye(3)
         step = np.linalg.solve(information + occam[:, :3], normal[:, 3] + occam[:, 3])
         motion += step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-9))
     motion[2] = wrap_angle(motion[2])
     covariance = np.linalg.inv(information)
-    covariance[2, 2] += (CAMERA * motion[2])**2
-    return Motion(motion, covariance, int((chi < GATE).sum()), len(first))
+    covariance[2, 2] += (FOCAL_SIGMA_SHARE * motion[2])**2
+    return Motion(motion, covariance, int((chi < MAX_MATCH_CHI2).sum()), len(first))
 
 
 def match(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -150,7 +153,7 @@ def match(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     highest = alike[row, best]
     alike[row, best] = -1.0
     # Distances of vectors of length 1.
-    clear = 1 - highest < RATIO**2 * (1 - alike.max(axis=1))
+    clear = 1 - highest < MAX_MATCH_RATIO**2 * (1 - alike.max(axis=1))
     kept = np.flatnonzero(mutual & clear)
     return np.stack([kept, best[kept]], axis=1)
 
@@ -194,7 +197,7 @@ def _way(first, second, yaw, bearing, off):
     # Off along and across the picture: p + q * way.
     p0, q0 = y - second[0] * x, dy - second[0] * dx
     p1, q1 = first[1] - second[1] * x, -second[1] * dx
-    way = min(max(-(p0 * q0 + p1 * q1) / (q0 * q0 + q1 * q1 + 1e-9), 0.0), NEAREST)
+    way = min(max(-(p0 * q0 + p1 * q1) / (q0 * q0 + q1 * q1 + 1e-9), 0.0), MAX_MOTION_DEPTH_SHARE)
     ahead = x + way * dx
     if ahead < 0.05:
         return way, 2.0

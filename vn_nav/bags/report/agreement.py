@@ -1,7 +1,7 @@
 """What a policy would have done on a recorded drive, compared with what was done.
 
 The policy is shown the pictures at which the robot's actions began, one after the other as its
-memory wants them, and is told what was done, not what it would have done: each of its answers is
+memory wants them, and receives what was done, not what it would have done: each of its answers is
 to the situation that was there.
 """
 
@@ -15,21 +15,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vn_nav.bags.dataset import DriveSet, Wanted, load_drives
-from vn_nav.bags.drive import NO_ACTION
+from vn_nav.bags.dataset import DriveSet, Wanted
+from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:  # it takes torch along
     from vn_nav.policy.checkpoint import LoadedCheckpoint
 
-LISTED = 300  # steps that are listed, at most
-SHOWN = 8  # disagreements with their pictures
+MAX_LISTED_STEPS = 300  # steps that are listed, at most
+MAX_SHOWN_DISAGREEMENTS = 8  # disagreements with their pictures
 STOP, OTHER, END = 'stop', 'fits none', 'episode ends'
 
 
 class Judged(NamedTuple):
-    """A step, and the policy's word on it."""
+    """A step, and the policy's answer there."""
 
     episode: int
     step: int  # of the episode
@@ -50,12 +51,12 @@ class Disagreement(NamedTuple):
 
 @dataclasses.dataclass
 class Agreement:
-    """The policy's word on a drive. A actions of the policy."""
+    """The policy's answers along a drive. A actions of the policy."""
 
     rows: tuple[str, ...]  # what was done: the actions, `OTHER`, `END`
     columns: tuple[str, ...]  # what the policy would have done: the actions, and `STOP` if it can
     table: np.ndarray  # [rows, columns] steps
-    steps: list[Judged]  # the first `LISTED`
+    steps: list[Judged]  # the first `MAX_LISTED_STEPS`
     worst: list[Disagreement]  # the largest first
     hindsight: int  # episodes whose last picture stood in for a goal
     done_sure: float  # mean probability of the actions that were done; nan: there were none
@@ -110,7 +111,7 @@ def _judge(drives: DriveSet, checkpoint: LoadedCheckpoint) -> Agreement:
         for row, judged in zip(range(steps.start, steps.stop),
                                _episode(drives, steps, goal, checkpoint, threshold), strict=True):
             found.table[rows.index(judged.done), columns.index(judged.would)] += 1
-            if len(found.steps) < LISTED:
+            if len(found.steps) < MAX_LISTED_STEPS:
                 found.steps.append(judged)
             if judged.done in actions:
                 found.done_sure += judged.done_sure
@@ -123,7 +124,7 @@ def _judge(drives: DriveSet, checkpoint: LoadedCheckpoint) -> Agreement:
 
 def _episode(drives: DriveSet, steps: slice, goal: np.ndarray, checkpoint: LoadedCheckpoint,
              threshold: float | None):
-    """The policy's word on each step of an episode."""
+    """The policy's answer at each step of an episode."""
     import torch
 
     from vn_nav.policy.runtime import BatchedPolicy
@@ -151,7 +152,7 @@ def _episode(drives: DriveSet, steps: slice, goal: np.ndarray, checkpoint: Loade
 def _keep_worst(worst: list[Disagreement], new: Disagreement) -> None:
     worst.append(new)
     worst.sort(key=lambda d: d.judged.done_sure - d.judged.sure)
-    del worst[SHOWN:]
+    del worst[MAX_SHOWN_DISAGREEMENTS:]
 
 
 def _upright(picture: np.ndarray) -> np.ndarray:

@@ -18,23 +18,23 @@ from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.doctor.figures import Diagnosis
 from vn_nav.bags.drive import (
-    ActionSegmenter,
     Frame,
     Report,
     TimestampedMessage,
     find_topics,
-    hear,
     synchronise,
+    timestamped_messages,
 )
 from vn_nav.bags.report.agreement import Agreement, judge
 from vn_nav.bags.report.figures import Film, Goals, Odometer, Shot, Timeline, Ways
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.segmenter import ActionSegmenter
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:  # it takes torch along
     from vn_nav.policy.checkpoint import LoadedCheckpoint
 
-RATES, VELOCITIES = 0.5, 0.05  # s: the shortest interval of either
+MIN_RATE_INTERVAL_S, MIN_VELOCITY_INTERVAL_S = 0.5, 0.05  # s: the shortest interval of either
 AXES = ('vx', 'vy', 'wz')
 
 
@@ -67,12 +67,12 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
         checkpoint: a policy to ask what it would have done.
 
     Raises:
-        UserError: no readable bag, one without a camera or anything that tells motion, or (with
+        UserError: no readable bag, one without a camera or anything that shows motion, or (with
             a checkpoint) a camera that is too narrow or no usable picture.
     """
     # Depth and labels are not shown; without them no picture waits for any.
     names = find_topics(bag, dataclasses.replace(topics, depth='', labels=''))
-    rates, velocities = Timeline(RATES), Timeline(VELOCITIES)
+    rates, velocities = Timeline(MIN_RATE_INTERVAL_S), Timeline(MIN_VELOCITY_INTERVAL_S)
     diagnosis = diagnose(bag, topics=topics, listen=lambda message: rates.add(
         message.connection.topic, message.log_time))
     velocities.origin = rates.origin  # one axis of time on the whole page
@@ -99,7 +99,7 @@ def show(bag: str | Path, *, topics: Topics, robot: RobotSpec,
 
 def _heard(bag: str | Path, names: Topics, velocities: Timeline) -> Iterator[TimestampedMessage]:
     """The messages of a drive; velocities are noted as they pass."""
-    for m in hear(bag, names):
+    for m in timestamped_messages(bag, names):
         kind = {names.command: 'commanded', names.odometry: 'measured'}.get(m.topic)
         if kind is not None:
             try:

@@ -17,7 +17,7 @@ from vn_nav.bags.storage.stream import messages
 from vn_nav.errors import UserError
 
 ARRIVED = 'arrived'
-LISTED = 5  # longest disagreements that are listed
+MAX_LISTED_DISAGREEMENTS = 5  # longest disagreements that are listed
 
 
 class Answer(NamedTuple):
@@ -87,7 +87,7 @@ def read_shadow(bag: str | Path) -> Shadow:
         UserError: no readable bag, or none of that kind.
     """
     names: list[str] = []
-    told: dict[int, tuple[int, str | None]] = {}  # episode, and what was done before
+    executed: dict[int, tuple[int, str | None]] = {}  # episode, and what was done before
     choices: dict[int, str] = {}
     commands: dict[int, np.ndarray] = {}
     filtered: dict[str, int] | None = None
@@ -102,7 +102,7 @@ def read_shadow(bag: str | Path) -> Shadow:
             case 'goal_image':
                 episode += 1
             case 'executed_action':
-                told[time] = episode, json.loads(record.message.data)['action']
+                executed[time] = episode, json.loads(record.message.data)['action']
             case 'action':
                 choices[time] = names[record.message.data]
             case 'arrived' if record.message.data:
@@ -111,13 +111,13 @@ def read_shadow(bag: str | Path) -> Shadow:
                 filtered = _filtered(record.message) or filtered
             case 'cmd_vel':
                 commands[time] = twist_to_array(record.message)
-    if not told:
+    if not executed:
         raise UserError('a bag to compare is one that `vn_nav bag drive` has written', str(bag),
                         'give --checkpoint and --compare to that command')
-    following = {one: told[other][1] for one, other in itertools.pairwise(told)
-                 if told[one][0] == told[other][0]}
+    following = {one: executed[other][1] for one, other in itertools.pairwise(executed)
+                 if executed[one][0] == executed[other][0]}
     return Shadow([Answer(time, own, choices[time], following.get(time))
-                   for time, (own, _) in told.items() if time in choices], commands, filtered)
+                   for time, (own, _) in executed.items() if time in choices], commands, filtered)
 
 
 def _filtered(diagnostics) -> dict[str, int] | None:
@@ -130,7 +130,7 @@ def _filtered(diagnostics) -> dict[str, int] | None:
 
 
 def filter_words(counts: dict[str, int] | None) -> str:
-    """What an action filter did, in a few words."""
+    """A short summary of what an action filter did."""
     return 'none' if counts is None else (
         f'acted at {counts["acted"]} of {counts["decisions"]} decisions, changed '
         f'{counts["changed"]}')
@@ -172,7 +172,8 @@ def compare(a: Shadow, b: Shadow, labels: tuple[str, str],
         arrived={'a': said[0], 'b': said[1], 'both': sorted(set(said[0]) & set(said[1]))},
         commands=len(both), mean_dv=_mean(np.hypot(*apart[:, :2].T)), mean_dw=_mean(apart[:, 2]),
         disagreements=len(runs), first=runs[0] if runs else None,
-        longest=sorted(runs, key=lambda run: (-run.decisions, run.begins))[:LISTED],
+        longest=sorted(runs, key=lambda run: (-run.decisions, run.begins))[
+            :MAX_LISTED_DISAGREEMENTS],
         latency={name: {'median': float(np.median(own)), 'p95': float(np.quantile(own, 0.95))}
                  for name, own in zip('ab', latencies, strict=True) if own},
         filtered={'a': a.filtered, 'b': b.filtered})

@@ -20,9 +20,11 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
-from vn_nav.bags.dataset import Wanted, read_steps
-from vn_nav.bags.drive import NO_ACTION, Report, find_topics
+from vn_nav.bags.dataset import Wanted
+from vn_nav.bags.drive import Report, find_topics
+from vn_nav.bags.drive_decoder import read_steps
 from vn_nav.bags.roles import COMPRESSED, Topics, full_name
+from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.storage.decoding import Decoder
 from vn_nav.bags.storage.stream import Bag, summary
 from vn_nav.errors import UserError

@@ -1,6 +1,6 @@
 """Which files a bag is made of, and which are recordings that have to be converted first.
 
-A folder is read whole or refused: a file that is left out without a word is a drive cut short.
+A folder is read whole or refused: a file that is left out silently is a drive cut short.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = ['METADATA', 'UNLISTED', 'BagFiles', 'OtherFormat', 'converted', 'file
 METADATA = 'metadata.yaml'
 UNLISTED = 'metadata.yaml does not name it'
 EMPTY = 'is empty'
-MAX_METADATA = 1 << 20  # bytes; a day of hourly files with a hundred topics has 200 kB
+MAX_METADATA_BYTES = 1 << 20  # bytes; a day of hourly files with a hundred topics has 200 kB
 MAX_NESTED = 32  # brackets within brackets
 FIRST_BYTES = {MAGIC: '.mcap', b'#ROSBAG V': '.bag'}  # of recordings, whatever their names
 
@@ -58,17 +58,17 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
 
     Whatever in the folder is a recording by its name or its first bytes is read or refused; hidden
     files, and folders within, are ignored. A file whose twin without the last ending lies
-    beside it (unpacked, or finished) is read by the twin, as `ros2 bag play` leaves them.
+    next to it (unpacked, or finished) is read by the twin, as `ros2 bag play` leaves them.
 
     Args:
         path: a rosbag2 folder or an MCAP file.
         strict: a metadata.yaml that is damaged, names a file that is not there, or does not name
             one that is there, is an error, and so is an MCAP file that cannot be opened, is empty,
             or is missing by the numbers of the others. Otherwise what is there is read, and
-            `losses` tell.
+            `losses` list.
 
     Raises:
-        OtherFormat: a file in another format, alone or beside MCAP files.
+        OtherFormat: a file in another format, alone or among MCAP files.
         BagError: no such file or folder, or one without MCAP files.
     """
     path = Path(path)
@@ -101,7 +101,7 @@ def files_of(path: str | Path, *, strict: bool = True) -> BagFiles:
         if not there and not faults:
             raise BagError(path, 'holds no MCAP file', rule=A_BAG, remedy=_elsewhere(path))
         losses = _unreadable(path, there, faults, rest, strict or not there)
-        return BagFiles(there, losses)  # the files tell all; the recorder may have been killed
+        return BagFiles(there, losses)  # the files show all; the recorder may have been killed
     try:
         information, listed = _listed(path, names)
     except OtherFormat:
@@ -150,7 +150,7 @@ def _unreadable(folder: Path, numbered: list[Path], faults: dict[Path, tuple[str
 
     Args:
         folder: of the bag.
-        numbered: files whose numbers tell of others.
+        numbered: files whose numbers imply others.
         faults: of those that cannot be read.
         rest: remedy that reads the others.
         strict: they are an error.
@@ -188,8 +188,8 @@ def _listed(folder: Path, names: list[str]) -> tuple[dict, list[Path]]:
     """What metadata.yaml says, and the files that it names, unpacked in place of compressed."""
     path = folder / METADATA
     try:
-        if path.stat().st_size > MAX_METADATA:
-            raise BagError(path, f'has more than {MAX_METADATA} bytes')
+        if path.stat().st_size > MAX_METADATA_BYTES:
+            raise BagError(path, f'has more than {MAX_METADATA_BYTES} bytes')
         information = load_yaml(path.read_text())['rosbag2_bagfile_information']
         listed = [str(name) for name in information['relative_file_paths']]
         mode, storage = (str(information.get(key) or '').lower()
@@ -218,7 +218,7 @@ def _origin(information: dict) -> tuple[str | None, dict[str, str] | None]:
     """The ROS distribution and the user's own data of a bag; None: it does not say."""
     distro, data = information.get('ros_distro'), information.get('custom_data')
     whole = isinstance(data, dict) and all(
-        isinstance(word, (str, int, float)) for pair in data.items() for word in pair)
+        isinstance(part, (str, int, float)) for pair in data.items() for part in pair)
     return (distro if isinstance(distro, str) and distro.isprintable() else None,
             {str(key): str(value) for key, value in data.items()} if whole and data else None)
 

@@ -15,14 +15,14 @@ from vn_nav.bags.storage.records import (
     CHUNK,
     DATA_END,
     HEAD,
-    MAX_RECORD,
+    MAX_RECORD_BYTES,
     MESSAGE,
     MESSAGE_INDEX,
     METADATA,
     SCHEMA,
     Damage,
     Fields,
-    words,
+    reason_of,
 )
 
 _CHUNK = struct.Struct('<QQQI')  # start, end, size, CRC
@@ -71,12 +71,12 @@ def begins_record(data: bytes) -> bool:
 def unpack(stored: memoryview, head: ChunkHead) -> bytes:
     """The records of a chunk out of the bytes that it stores them in."""
     size, cost = head.size, len(stored) + head.size
-    if size > MAX_RECORD:
-        raise Damage(f'a chunk declares {size} bytes, more than {MAX_RECORD}')
+    if size > MAX_RECORD_BYTES:
+        raise Damage(f'a chunk declares {size} bytes, more than {MAX_RECORD_BYTES}')
     try:
         data = _inflate(stored, head.compression, size)
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
-        raise Damage(f'a chunk cannot be decompressed ({head.compression}): {words(error)}',
+        raise Damage(f'a chunk cannot be decompressed ({head.compression}): {reason_of(error)}',
                      cost=cost) from error
     if len(data) != size:
         raise Damage(f'a chunk declares {size} bytes and holds another number', cost=cost)

@@ -55,14 +55,14 @@ def compared(total: int | None, counts: Mapping[int, int] | None, declared: Decl
 def _difference(differing: Mapping[str, tuple[int, int]]) -> Count:
     """By what it is of: messages that are counted, and read."""
     apart = {name: pair for name, pair in differing.items() if pair[0] != pair[1]}
-    words = [f'it counts {counted} messages{name}, and {read} were read'
-             for name, (counted, read) in apart.items()]
-    if len(words) > MAX_NAMED_CHANNELS:
-        words[MAX_NAMED_CHANNELS:] = [
-            f'and so with {len(words) - MAX_NAMED_CHANNELS} other channels']
+    faults = [f'it counts {counted} messages{name}, and {read} were read'
+              for name, (counted, read) in apart.items()]
+    if len(faults) > MAX_NAMED_CHANNELS:
+        faults[MAX_NAMED_CHANNELS:] = [
+            f'and so with {len(faults) - MAX_NAMED_CHANNELS} other channels']
     return Count(sum(max(counted - read, 0) for counted, read in apart.values()),
                  sum(max(read - counted, 0) for counted, read in apart.values()),
-                 ('; '.join(words),) if words else ())
+                 ('; '.join(faults),) if faults else ())
 
 
 def _name(number: int, declared: Declared) -> str:

@@ -46,10 +46,10 @@ class Account:
             self.losses[-1].after = start
         self.seen = end if self.seen is None else max(self.seen, end)
 
-    def fault(self, at: int, words: str, *, harmless: bool = True) -> None:
+    def fault(self, at: int, reason: str, *, harmless: bool = True) -> None:
         """Note a fault that cost no bytes."""
         if len(self.losses) < MAX_LOSSES:
-            self.losses.append(Loss(self._path, at, 0, words, harmless=harmless))
+            self.losses.append(Loss(self._path, at, 0, reason, harmless=harmless))
         elif not harmless:
             self.losses[-1].harmless = False
 

@@ -25,16 +25,16 @@ from vn_nav.bags.storage.records import (
     CHANNEL,
     CHUNK,
     DATA_END,
+    FIRST_UNKNOWN_OPCODE,
     FOOTER,
     HEAD,
     HEADER,
-    MAX_RECORD,
+    MAX_RECORD_BYTES,
     MESSAGE,
     MESSAGE_FIELDS,
     MESSAGE_INDEX,
     METADATA,
     SCHEMA,
-    UNKNOWN,
     Damage,
     Declared,
     Message,
@@ -42,7 +42,7 @@ from vn_nav.bags.storage.records import (
 from vn_nav.bags.storage.salvage import Gap, declare, mistaken, salvaged, swallowed
 from vn_nav.bags.storage.summary import MAGIC, READ_BYTES, Summary, crc_of, peek
 
-CANDIDATE = 256  # bytes of patience that a place costs which only looks like a record
+CANDIDATE_COST_BYTES = 256  # bytes of patience that a place costs which only looks like a record
 _CHUNK_START = re.compile(rb'\x06.{7}\0.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)', re.DOTALL)
 _WITHOUT_MESSAGES = (HEADER, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
 _MARK = 4  # bytes of the body of the record that ends the data
@@ -95,7 +95,7 @@ class DamagedFile:
                 at, trusted = end, True
             except Damage as damage:
                 self.crc = None
-                self._patience -= damage.cost + CANDIDATE
+                self._patience -= damage.cost + CANDIDATE_COST_BYTES
                 end = damage.end if trusted else None
                 trusted = end is not None
                 harmless = trusted and opcode in _WITHOUT_MESSAGES
@@ -128,7 +128,7 @@ class DamagedFile:
         following = self._next_chunk(at + 1)
         if opcode == MESSAGE:
             end = self._evidence.message_end(at)
-            if end - at > MAX_RECORD or following is not None and end > following:
+            if end - at > MAX_RECORD_BYTES or following is not None and end > following:
                 raise Damage(f'a message declares {length} bytes, over other records')
             record = self._peek(at, end - at)
             if inner := swallowed(record, MESSAGE_FIELDS.size, len(record), self._declared):
@@ -142,17 +142,17 @@ class DamagedFile:
             if end != at + HEAD.size + length:
                 self._mended(at, f'a record of kind {opcode} declares a wrong length')
             if declares:
-                if end - at > MAX_RECORD:
-                    raise Damage(f'a record has more than {MAX_RECORD} bytes')
+                if end - at > MAX_RECORD_BYTES:
+                    raise Damage(f'a record has more than {MAX_RECORD_BYTES} bytes')
                 body = self._peek(at + HEAD.size, end - at - HEAD.size)
-                if words := declare(self._declared, opcode, body, end):
-                    self._mended(at, words)
+                if note := declare(self._declared, opcode, body, end):
+                    self._mended(at, note)
                 self._tell_disputes(at)
         else:
             end = at + HEAD.size + length
             if end > self._limit or not self._evidence.begins(end):
                 raise Damage(f'there is no record of kind {opcode}')
-            if opcode < UNKNOWN:
+            if opcode < FIRST_UNKNOWN_OPCODE:
                 raise Damage(f'a record of kind {opcode} does not belong here', end=end)
             self.passed[opcode] += end - at
         if following is not None and end > following:
@@ -225,8 +225,8 @@ class DamagedFile:
                 self._evidence.begins(begin + rest)):
             end = begin + rest  # fields of a later version
         try:
-            if size > MAX_RECORD:
-                raise Damage(f'a chunk has {size} bytes, more than {MAX_RECORD}')
+            if size > MAX_RECORD_BYTES:
+                raise Damage(f'a chunk has {size} bytes, more than {MAX_RECORD_BYTES}')
             stored = self._peek(begin, size)
             right = right_size(head, stored)
             data = unpack(memoryview(stored), right)
@@ -273,7 +273,7 @@ class DamagedFile:
         position = 0
         while (match := pattern.search(data, position)) and self._patience > 0:
             at, position = base + match.start(), match.start() + 1
-            self._patience -= CANDIDATE
+            self._patience -= CANDIDATE_COST_BYTES
             if self._looks_right(at, pattern):
                 return at
         return None
@@ -286,7 +286,7 @@ class DamagedFile:
             if pattern is _CHUNK_START:
                 head = chunk_head(self._peek(at + HEAD.size, 64))
                 return (head.stored == length - head.at and length <= self._limit - at - HEAD.size
-                        and max(head.size, length) <= MAX_RECORD)
+                        and max(head.size, length) <= MAX_RECORD_BYTES)
             self._evidence.message_end(at)
             return self._evidence.begins(at, self._account.seen, 0)
         except Damage:
@@ -320,7 +320,7 @@ class DamagedFile:
             self.crc = None
         self._declared.disputes.clear()
 
-    def _mended(self, at: int, words: str) -> None:
+    def _mended(self, at: int, note: str) -> None:
         """Note a fault that cost nothing."""
         self.crc = None
-        self._account.fault(at, words)
+        self._account.fault(at, note)

@@ -21,9 +21,9 @@ from vn_nav.bags.roles import full_name
 from vn_nav.bags.storage.bag_files import OtherFormat, converted
 from vn_nav.bags.storage.records import BagError, Connection, Message
 
-MAX_DEFINITION = 256 << 10  # bytes; the longest of Jazzy and MoveIt have about 100 kB
-MAX_UNROLLED = 4096  # elements of a fixed array for which code is generated one by one
-MAX_FIXED = 64 << 20  # bytes that a message has at least
+MAX_DEFINITION_BYTES = 256 << 10  # bytes; the longest of Jazzy and MoveIt have about 100 kB
+MAX_UNROLLED_ELEMENTS = 4096  # elements of a fixed array for which code is generated one by one
+MAX_FIXED_BYTES = 64 << 20  # bytes that a message has at least
 MAX_NESTING = 32  # of types within types
 # A list of numbers is one array, whatever its length; of anything else each element is a Python
 # object, a hundred times larger than its bytes can be.
@@ -126,8 +126,9 @@ def _learn(name: str, encoding: str, definition: bytes) -> _Kind:
         return _kind(known, name)
     if encoding != 'ros2msg':
         raise _Unusable(f'its definition is {encoding!r}, not ros2msg')
-    if len(definition) > MAX_DEFINITION:
-        raise _Unusable(f'its definition has {len(definition)} bytes, more than {MAX_DEFINITION}')
+    if len(definition) > MAX_DEFINITION_BYTES:
+        raise _Unusable(f'its definition has {len(definition)} bytes, more than '
+                        f'{MAX_DEFINITION_BYTES}')
     try:
         types = get_types_from_msg(definition.decode(), name)
         name = normalize_msgtype(name)
@@ -193,11 +194,11 @@ def _least(name: str, types: dict, known: dict[str, tuple[int, int]], depth: int
             size += 4
             smallest += [own] if objects else []
         else:
-            if node == Nodetype.ARRAY and not 0 < count <= (MAX_UNROLLED if objects else
-                                                            MAX_FIXED):
+            if node == Nodetype.ARRAY and not 0 < count <= (MAX_UNROLLED_ELEMENTS if objects else
+                                                            MAX_FIXED_BYTES):
                 raise _Unusable(f'its definition has an array of {count} elements')
             size += own * count
-        if size > MAX_FIXED:
-            raise _Unusable(f'its definition has more than {MAX_FIXED} bytes')
+        if size > MAX_FIXED_BYTES:
+            raise _Unusable(f'its definition has more than {MAX_FIXED_BYTES} bytes')
     known[name] = max(size, 1), min(smallest, default=0)
     return known[name]

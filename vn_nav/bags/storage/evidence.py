@@ -21,24 +21,25 @@ from vn_nav.bags.storage.records import (
     CHANNEL,
     CHUNK,
     DATA_END,
+    FIRST_UNKNOWN_OPCODE,
     HEAD,
     HEADER,
-    MAX_NAME,
-    MAX_RECORD,
-    MAX_TIME,
+    MAX_NAME_BYTES,
+    MAX_RECORD_BYTES,
+    MAX_TIME_NS,
     MESSAGE,
     MESSAGE_FIELDS,
     MESSAGE_INDEX,
     METADATA,
     SCHEMA,
-    UNKNOWN,
     Damage,
     Declared,
 )
 
-NEAR = 86_400 * 10**9  # ns between neighbours in a file, at most, where time is evidence
-LOOK = 128  # bytes of a record that are enough to tell what it is
-STEPS = 4  # unknown records in a row that are believed
+# Between neighbours in a file, at most, where time is evidence.
+MAX_NEIGHBOUR_GAP_NS = 86_400 * 10**9
+PEEK_BYTES = 128  # of a record: enough to know its kind
+MAX_UNKNOWN_RECORDS = 4  # unknown records in a row that are believed
 COMPRESSIONS = (b'\0\0\0\0', b'\3\0\0\0lz4', b'\4\0\0\0zstd')
 MESSAGE_START = re.compile(rb'\x05.{4}\0{4}.{22}', re.DOTALL)
 DECLARATION_START = re.compile(rb'[\3\4].{4}\0{4}', re.DOTALL)
@@ -54,7 +55,7 @@ DELIMITED = {
 IN_CHUNKS = frozenset((SCHEMA, CHANNEL, MESSAGE))
 IN_DATA = IN_CHUNKS | {CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END}
 # In the order of trust; a header has the fields of a metadata record, and never comes again.
-_TOLD_BY_FIELDS = (CHUNK, MESSAGE_INDEX, CHANNEL, SCHEMA, ATTACHMENT, METADATA)
+_KNOWN_BY_FIELDS = (CHUNK, MESSAGE_INDEX, CHANNEL, SCHEMA, ATTACHMENT, METADATA)
 _DATA_END_SIZE = 4  # bytes of its body
 
 
@@ -86,15 +87,16 @@ class Evidence:
             return opcode
         if self._anchored(at):
             return MESSAGE
-        body = self._peek(at + HEAD.size, min(length, LOOK))
+        body = self._peek(at + HEAD.size, min(length, PEEK_BYTES))
         if at == self._first:
             return HEADER if self._fits(at, HEADER, length, body) else opcode
-        if opcode in _TOLD_BY_FIELDS and (self._fits(at, opcode, length, body, later=True)
-                                          or self._fields_end(at, opcode) == end):
+        if opcode in _KNOWN_BY_FIELDS and (self._fits(at, opcode, length, body, later=True)
+                                           or self._fields_end(at, opcode) == end):
             return opcode
-        for kind in _TOLD_BY_FIELDS:
+        for kind in _KNOWN_BY_FIELDS:
             if kind in self._kinds and self._fits(at, kind, length, body):
-                return opcode if opcode >= UNKNOWN and _is_private(opcode, kind) else kind
+                private = opcode >= FIRST_UNKNOWN_OPCODE and _is_private(opcode, kind)
+                return opcode if private else kind
         if opcode != MESSAGE and self._is_message(at, opcode, length):
             return MESSAGE
         if length == _DATA_END_SIZE and end == self._limit and DATA_END in self._kinds:
@@ -105,7 +107,7 @@ class Evidence:
         """Whether a message may be of a time [ns]; True where nothing is stated."""
         return self._span is None or self._span[0] <= time <= self._span[1]
 
-    def begins(self, at: int, near: int | None = None, steps: int = STEPS) -> bool:
+    def begins(self, at: int, near: int | None = None, steps: int = MAX_UNKNOWN_RECORDS) -> bool:
         """Whether a record begins here, or the records end.
 
         Args:
@@ -117,14 +119,14 @@ class Evidence:
             return True
         if at > self._limit:
             return False
-        head = self._peek(at, min(LOOK, self._limit - at))
+        head = self._peek(at, min(PEEK_BYTES, self._limit - at))
         if len(head) < HEAD.size:
             return self._cut and head[0] in self._kinds and not any(head[5:])
         opcode, length = HEAD.unpack_from(head)
         fits = length <= self._limit - at - HEAD.size
         if self._message(head, fits, near) or fits and self.kind(at, opcode, length) != opcode:
             return True
-        if opcode >= UNKNOWN:
+        if opcode >= FIRST_UNKNOWN_OPCODE:
             return fits and steps > 0 and self.begins(at + HEAD.size + length, near, steps - 1)
         if opcode not in self._kinds or opcode == MESSAGE:
             return self._cut and len(head) < MESSAGE_FIELDS.size and opcode == MESSAGE
@@ -138,7 +140,7 @@ class Evidence:
         text = body[before + 4:before + 4 + size]
         if (fits or self._cut) and before + 4 + size <= length and (
                 size % 16 == 0 if opcode == MESSAGE_INDEX else
-                size <= MAX_NAME and not any(byte < 32 for byte in text)):
+                size <= MAX_NAME_BYTES and not any(byte < 32 for byte in text)):
             return True
         # Damaged within, maybe: its length is right if it leads to the next record.
         return fits and length > before and steps > 0 and self.begins(
@@ -156,8 +158,8 @@ class Evidence:
         _, length, _, _, log_time, publish_time = MESSAGE_FIELDS.unpack(head)
         end = at + HEAD.size + length
         following = self.anchor(at + 1)
-        if (length < MESSAGE_FIELDS.size - HEAD.size or log_time > MAX_TIME
-                or publish_time > MAX_TIME or end > self._limit
+        if (length < MESSAGE_FIELDS.size - HEAD.size or log_time > MAX_TIME_NS
+                or publish_time > MAX_TIME_NS or end > self._limit
                 or following is not None and end > following):
             raise Damage(f'a message declares {length} bytes, over the next record')
         if not self.begins(end, log_time):
@@ -219,7 +221,8 @@ class Evidence:
         near = publish_time if near is None else near
         signs = (opcode == MESSAGE, fits and length >= MESSAGE_FIELDS.size - HEAD.size,
                  channel in self._declared,
-                 abs(log_time - near) < NEAR and max(log_time, publish_time) <= MAX_TIME)
+                 abs(log_time - near) < MAX_NEIGHBOUR_GAP_NS
+                 and max(log_time, publish_time) <= MAX_TIME_NS)
         return sum(signs) >= 3
 
     def _fields_end(self, at: int, opcode: int) -> int | None:
@@ -249,7 +252,7 @@ class Evidence:
         elif kind == MESSAGE_INDEX:  # places in a chunk: times would be larger
             places = range(before + 12, min(before + 4 + size, len(body) - 7), 16)
             if size % 16 or later and not size or any(
-                    int.from_bytes(body[k:k + 8], 'little') > MAX_RECORD for k in places):
+                    int.from_bytes(body[k:k + 8], 'little') > MAX_RECORD_BYTES for k in places):
                 return False
         elif not may_name(body[before + 4:before + 4 + size], size, empty=kind == HEADER):
             return False
@@ -262,10 +265,11 @@ class Evidence:
             return False
         _, _, channel, _, log_time, publish_time = MESSAGE_FIELDS.unpack(
             self._peek(at, MESSAGE_FIELDS.size))
-        if opcode == MESSAGE_INDEX and publish_time <= MAX_RECORD:  # a place in a chunk
+        if opcode == MESSAGE_INDEX and publish_time <= MAX_RECORD_BYTES:  # a place in a chunk
             return False
-        return (channel in self._declared and max(log_time, publish_time) <= MAX_TIME and (
-            abs(log_time - publish_time) < NEAR if self._span is None else self.in_span(log_time)))
+        return (channel in self._declared and max(log_time, publish_time) <= MAX_TIME_NS and (
+            abs(log_time - publish_time) < MAX_NEIGHBOUR_GAP_NS if self._span is None
+            else self.in_span(log_time)))
 
 
 def _is_private(opcode: int, kind: int) -> bool:
@@ -279,4 +283,4 @@ def _is_private(opcode: int, kind: int) -> bool:
 
 def may_name(text: bytes | bytearray, size: int, *, empty: bool) -> bool:
     """Whether bytes may be the beginning of a name of a size."""
-    return (empty or size > 0) and size <= MAX_NAME and not any(byte < 32 for byte in text)
+    return (empty or size > 0) and size <= MAX_NAME_BYTES and not any(byte < 32 for byte in text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import NamedTuple
 
-from vn_nav.bags.storage.evidence import LOOK, Evidence
+from vn_nav.bags.storage.evidence import PEEK_BYTES, Evidence
 from vn_nav.bags.storage.records import HEAD, MESSAGE_INDEX, Damage, Declared, Fields
 from vn_nav.bags.storage.salvage import sign_of
 
@@ -82,7 +82,7 @@ def _records(peek: Callable[[int, int], bytes], evidence: Evidence, at: int, siz
         entries: list[tuple[int, int]] = []
         try:
             end = evidence.delimited_end(at, MESSAGE_INDEX, length)
-            if end - at > size + LOOK:
+            if end - at > size + PEEK_BYTES:
                 break
             fields = Fields(peek(at + HEAD.size, end - at - HEAD.size))
             channel, = fields.numbers('<H')

@@ -20,7 +20,7 @@ from vn_nav.bags.storage.records import (
     DATA_END,
     FOOTER,
     HEAD,
-    MAX_RECORD,
+    MAX_RECORD_BYTES,
     MESSAGE,
     SCHEMA,
     BagError,
@@ -28,8 +28,8 @@ from vn_nav.bags.storage.records import (
     Damage,
     Declared,
     Message,
+    reason_of,
     records,
-    words,
 )
 from vn_nav.bags.storage.salvage import mistaken
 from vn_nav.bags.storage.summary import MAGIC, Summary, crc_of, peek
@@ -43,7 +43,7 @@ class McapFile:
     Args:
         path: of the file.
         strict: damage is an error. Otherwise it is passed over, to the next record that is whole,
-            and `losses` and `missing` tell of it.
+            and `losses` and `missing` list it.
 
     Raises:
         BagError: no such file; if strict, also one without its end, or with a bad index.
@@ -67,7 +67,7 @@ class McapFile:
                 self._size = os.fstat(file.fileno()).st_size
                 self._look_at_the_ends(file)
         except (OSError, MemoryError) as error:
-            raise BagError(path, words(error)) from error
+            raise BagError(path, reason_of(error)) from error
         self._opening = list(self.losses)
 
     @property
@@ -112,7 +112,7 @@ class McapFile:
             with open(self.path, 'rb') as file:
                 yield from read(file, declared, bool(self._summary.data_crc) and not skipped)
         except (OSError, MemoryError) as error:
-            raise BagError(self.path, words(error)) from error
+            raise BagError(self.path, reason_of(error)) from error
 
     def _look_at_the_ends(self, file: BinaryIO) -> None:
         """Check the first and last bytes, and read the summary that the last point to."""
@@ -209,8 +209,8 @@ class McapFile:
             raise Damage('there is no record of kind 0')
         if length > left:
             raise Damage(f'a record declares {length} bytes where {left} are left')
-        if length > MAX_RECORD and opcode in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
-            raise Damage(f'a record has {length} bytes, more than {MAX_RECORD}')
+        if length > MAX_RECORD_BYTES and opcode in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
+            raise Damage(f'a record has {length} bytes, more than {MAX_RECORD_BYTES}')
         return opcode, length, head
 
     def _compare(self, declared: Declared) -> Count:

@@ -16,7 +16,7 @@ class Losses:
     def __init__(self):
         self._last: list[int] = []  # number of each publisher; the latest at the end
 
-    def hear(self, number: int, publishers: int) -> int:
+    def add(self, number: int, publishers: int) -> int:
         """Messages lost before this one.
 
         Args:

@@ -11,13 +11,10 @@ from __future__ import annotations
 
 import collections
 import os
-import pickle
 import struct
-import tempfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -36,77 +33,12 @@ from mcap.records import (
     SummaryOffset,
 )
 
-CHUNK = 256 * 1024  # bytes of records, or one message if that is larger
-LEVEL = 1  # of zstd
+from vn_nav.bags.storage.file_parts import FileParts, Part
+
+CHUNK_BYTES = 256 * 1024  # bytes of records, or one message if that is larger
+ZSTD_LEVEL = 1  # of zstd
 MAGIC = b'\x89MCAP0\r\n'
-MESSAGE_HEAD = 31  # bytes of a message's record before its data
-MIN_PARTS_IN_MEMORY = 512  # parts in memory, at least: what a full disk may take back at once
-
-
-class _Part(NamedTuple):
-    """A stretch of the file that stands: what opens it, or a chunk with its message indexes."""
-
-    end: int = 0  # offset
-    crc: int = 0  # of the file up to there
-    span: tuple[int, int] | None = None  # least and greatest stamp up to there
-    declared: tuple[Schema | Channel, ...] = ()
-    index: bytes = b''  # type: ignore[assignment]  # its record in the summary
-    counts: tuple[tuple[int, int], ...] = ()  # channel, messages
-
-
-class _Parts:
-    """The parts of a file, the last ones in memory.
-
-    A picture is a chunk, and an hour has 220,000: the others wait in a nameless file in the same
-    folder, of which nothing is left when the recorder is killed.
-    """
-
-    def __init__(self, folder: Path):
-        self._folder = folder
-        self._file: IO[bytes] | None = None
-        self._last: list[_Part] = [_Part()]
-        self._blocks: list[tuple[int, int]] = []  # place, size of earlier parts
-
-    @property
-    def last(self) -> _Part:
-        return self._last[-1]
-
-    def push(self, part: _Part) -> None:
-        self._last.append(part)
-        if len(self._last) < 2 * MIN_PARTS_IN_MEMORY:
-            return
-        block = zlib.compress(pickle.dumps(
-            [tuple(part) for part in self._last[:MIN_PARTS_IN_MEMORY]]), 1)
-        place = sum(self._blocks[-1]) if self._blocks else 0
-        try:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)
-            if os.pwrite(self._file.fileno(), block, place) < len(block):
-                return
-        except OSError:  # a full disk, which the bag itself meets next; they stay in memory
-            return
-        self._blocks.append((place, len(block)))
-        del self._last[:MIN_PARTS_IN_MEMORY]
-
-    def pop(self) -> _Part:
-        part = self._last.pop()
-        if not self._last:
-            self._last = self._block(*self._blocks.pop())
-        return part
-
-    def __iter__(self) -> Iterator[_Part]:
-        for block in self._blocks:
-            yield from self._block(*block)
-        yield from self._last
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
-
-    def _block(self, place: int, size: int) -> list[_Part]:
-        assert self._file is not None  # where blocks are
-        data = os.pread(self._file.fileno(), size, place)
-        return [_Part(*values) for values in pickle.loads(zlib.decompress(data))]
+MESSAGE_HEAD_BYTES = 31  # bytes of a message's record before its data
 
 
 class McapOutput:
@@ -125,10 +57,10 @@ class McapOutput:
 
     def __init__(self, path: Path, library: str = 'vn_nav'):
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        self._parts = _Parts(path.parent)
+        self._parts = FileParts(path.parent)
         self._known: list[Schema | Channel] = []  # in the parts
         self._chunks = 0
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
         self._schemas: dict[tuple[str, str, bytes], int] = {}  # ids
         self._channels = 0
         self._begin_chunk()
@@ -137,7 +69,7 @@ class McapOutput:
         head.write(MAGIC)
         Header('ros2', library).write(head)
         try:
-            self._append(head.end(), _Part())
+            self._append(head.end(), Part())
         except OSError:
             os.close(self._file)
             os.unlink(path)
@@ -186,14 +118,14 @@ class McapOutput:
             sequence: number that its publisher gave it.
             published: ns since 1970; None: as `stamp`.
         """
-        if self._index and self._chunk.count + MESSAGE_HEAD + len(data) > CHUNK:
+        if self._index and self._chunk.count + MESSAGE_HEAD_BYTES + len(data) > CHUNK_BYTES:
             self.flush()
         index = self._index.setdefault(channel, MessageIndex(channel_id=channel, records=[]))
         index.records.append((stamp, self._chunk.count))
         Message(channel_id=channel, log_time=stamp, data=data,
                 publish_time=stamp if published is None else published,
                 sequence=sequence & 0xFFFFFFFF).write(self._chunk)
-        if self._chunk.count >= CHUNK:
+        if self._chunk.count >= CHUNK_BYTES:
             self.flush()
 
     def flush(self) -> None:
@@ -220,8 +152,8 @@ class McapOutput:
                    compressed_size=len(chunk.data), uncompressed_size=len(records)).write(builder)
         stamps += last.span or ()
         counts = tuple((channel, len(index.records)) for channel, index in indexes.items())
-        self._append(written, _Part(span=(min(stamps), max(stamps)), declared=tuple(declared),
-                                    index=builder.end(), counts=counts))
+        self._append(written, Part(span=(min(stamps), max(stamps)), declared=tuple(declared),
+                                   index=builder.end(), counts=counts))
         self.counts.update(dict(counts))
 
     def sync(self) -> None:
@@ -270,7 +202,7 @@ class McapOutput:
         record.write(self._chunk)
         self._declared.append(record)
 
-    def _append(self, data: bytes, part: _Part) -> None:
+    def _append(self, data: bytes, part: Part) -> None:
         """Write a part whose end and checksum are yet to be filled in."""
         last = self._parts.last
         self._write(data, last.end)
@@ -333,7 +265,7 @@ class McapOutput:
         for part in self._parts:
             at, crc = at + len(part.index), zlib.crc32(part.index, crc)
             builder.write(part.index)
-            if builder.count >= CHUNK:
+            if builder.count >= CHUNK_BYTES:
                 yield builder.end()
         yield builder.end()
         if at > begin:

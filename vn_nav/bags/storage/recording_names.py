@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 KINDS = {'.db3': 'a bag in SQLite', '.bag': 'a bag of ROS 1', '.mcap': 'an MCAP file'}
-UNPACK = {  # what compressed files as a whole, and what unpacks them beside themselves
+UNPACK = {  # what compressed files as a whole, and what unpacks them into the same folder
     '.zst': 'zstd -d', '.zstd': 'zstd -d', '.gz': 'gunzip -k', '.bz2': 'bunzip2 -k',
     '.xz': 'unxz -k', '.lz4': 'lz4 -d -m'}
 ARCHIVES = {  # the same for archives; the folder follows
@@ -66,7 +66,7 @@ def conversion(path: Path, found: Recording, names: Iterable[str], alone: bool) 
     Args:
         path: of the file.
         found: what its name says.
-        names: of the files beside it.
+        names: of the other files there.
         alone: it is the one file that was asked for, and not its folder.
     """
     what, last = KINDS[found.kind], found.more[-1] if found.more else ''
@@ -82,7 +82,7 @@ def conversion(path: Path, found: Recording, names: Iterable[str], alone: bool) 
                 f'unpack it with `{UNPACK[last]} {quoted(pattern)}`')
     if last in JOURNALS:
         return (f'a part of {what} whose .db3 file is not there',
-                f'copy {shlex.quote(found.name)} beside it')
+                f'copy {shlex.quote(found.name)} next to it')
     if last in UNFINISHED:
         what += ' that is not finished, or whose recorder was killed'
         if found.kind == '.mcap':
@@ -106,7 +106,7 @@ def converted(source: str | Path, names: Iterable[str] = ()) -> str:
 
     Args:
         source: a file, a folder or a pattern of files.
-        names: of the files there. What SQLite keeps beside its files has to be put into them
+        names: of the files there. What SQLite keeps next to its files has to be put into them
             first: the converter looks at the .db3 files alone.
     """
     source = Path(source)

@@ -18,19 +18,20 @@ from vn_nav.errors import UserError
 (HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT,
  ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END) = range(1, 16)
 A_BAG = 'a bag is a folder with metadata.yaml and MCAP files, or one MCAP file'
-UNKNOWN = 0x10  # and above: of later versions, or (from 0x80) of applications; passed over
+# This one and above: of later versions, or (from 0x80) of applications; passed over.
+FIRST_UNKNOWN_OPCODE = 0x10
 # A chunk of rosbag2 has 768 KiB; a picture at the cap of `vn_msgs_py.images` has 192 MB at most
 # (16 million pixels of twelve bytes). What is larger is no recording of a robot's cameras.
-MAX_RECORD = 256 << 20  # bytes of a message, or of a chunk, compressed or not
-MAX_DECLARED = 16 << 20  # bytes of all schemas and channels of a file; a large robot has 1 MB
-MAX_NAME = 1024  # bytes of the name of a topic or type; ROS allows 255
-MAX_TIME = 2**63 - 1  # ns: the year 2262, and what rosbag2's own times can hold
+MAX_RECORD_BYTES = 256 << 20  # of a message, or of a chunk, compressed or not
+MAX_DECLARED_BYTES = 16 << 20  # of all schemas and channels of a file; a large robot has 1 MB
+MAX_NAME_BYTES = 1024  # of the name of a topic or type; ROS allows 255
+MAX_TIME_NS = 2**63 - 1  # ns: the year 2262, and what rosbag2's own times can hold
 
 HEAD = struct.Struct('<BQ')  # opcode, length
 MESSAGE_FIELDS = struct.Struct('<BQHIQQ')  # head, channel, sequence, log time, publish time
 # Kinds that would hide messages, a message that is too short, and what is no kind at all.
 NEVER_IN_CHUNKS = (0, MESSAGE, CHUNK, DATA_END, FOOTER)
-OVERHEAD = 256  # bytes of memory that a channel takes beside its texts
+CHANNEL_OVERHEAD_BYTES = 256  # of memory that a channel takes in addition to its texts
 
 
 class BagError(UserError):
@@ -80,7 +81,7 @@ class Damage(Exception):
     """What is wrong at a place.
 
     Args:
-        fault: in words.
+        fault: a text for people.
         end: where the record ends nevertheless, if that is believed.
         cost: bytes that were read to find out.
     """
@@ -120,8 +121,9 @@ class Fields:
             text = data.decode()
         except UnicodeDecodeError as error:
             raise Damage(f'a text is not UTF-8: {data[:32]!r}') from error
-        if name and (len(data) > MAX_NAME or not text.isprintable()):
-            raise Damage(f'a name is not printable, or longer than {MAX_NAME}: {data[:32]!r}')
+        if name and (len(data) > MAX_NAME_BYTES or not text.isprintable()):
+            raise Damage(f'a name is not printable, or longer than {MAX_NAME_BYTES}: '
+                         f'{data[:32]!r}')
         return text
 
 
@@ -137,7 +139,7 @@ class Declared:
 
     Attributes:
         read: messages that were read, by channel, of those that are asked for.
-        disputes: in words, and whether it is known which declaration is right.
+        disputes: texts, and whether it is known which declaration is right.
     """
 
     def __init__(self, path: Path, wanted: Callable[[str], bool], *, forgiving: bool = False):
@@ -181,7 +183,7 @@ class Declared:
             if self._declared[number] == channel or not self._replaces(number, channel):
                 return
             self._declared[number] = channel
-        self._grow(len(topic) + sum(len(a) + len(b) for a, b in metadata) + OVERHEAD)
+        self._grow(len(topic) + sum(len(a) + len(b) for a, b in metadata) + CHANNEL_OVERHEAD_BYTES)
         if not self._wanted(topic):
             self.chosen[number] = None
         if schema and schema not in self._schemas:
@@ -231,10 +233,10 @@ class Declared:
         self.chosen.pop(number, None)
         return True
 
-    def _dispute(self, words: str, *, sure: bool = False) -> None:
+    def _dispute(self, text: str, *, sure: bool = False) -> None:
         if not self._forgiving:
-            raise Damage(words)
-        self.disputes.append((words, sure))
+            raise Damage(text)
+        self.disputes.append((text, sure))
 
     def _settle(self, number: int) -> None:
         schema, topic, encoding, metadata = self._declared[number]
@@ -246,11 +248,11 @@ class Declared:
 
     def _grow(self, size: int) -> None:
         self._size += size
-        if self._size > MAX_DECLARED:
-            raise Damage(f'schemas and channels have more than {MAX_DECLARED} bytes')
+        if self._size > MAX_DECLARED_BYTES:
+            raise Damage(f'schemas and channels have more than {MAX_DECLARED_BYTES} bytes')
 
 
-def words(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
     """What an error of the system or of a decompressor says."""
     return 'it takes more memory than there is' if isinstance(error, MemoryError) else str(error)
 
@@ -273,7 +275,7 @@ def records(data: bytes, declared: Declared) -> Iterator[Message]:
                 MESSAGE_FIELDS.unpack_from(data, at))
             at += size
             stop = at + length - (size - HEAD.size)
-            if not at <= stop <= end or log_time > MAX_TIME or publish_time > MAX_TIME:
+            if not at <= stop <= end or log_time > MAX_TIME_NS or publish_time > MAX_TIME_NS:
                 raise Damage(f'a message declares {length} bytes and the times {log_time} and '
                              f'{publish_time} ns')
             if channel not in chosen:

@@ -19,20 +19,20 @@ from vn_nav.bags.storage.evidence import (
 )
 from vn_nav.bags.storage.records import (
     CHANNEL,
+    FIRST_UNKNOWN_OPCODE,
     HEAD,
     MESSAGE,
     MESSAGE_FIELDS,
     NEVER_IN_CHUNKS,
     SCHEMA,
-    UNKNOWN,
     Damage,
     Declared,
     Fields,
     Message,
 )
 
-TRIES = 64  # places that look like a message and are looked at, within another or after damage
-CHAIN = 50_000  # messages that one may have swallowed, at most, to be found out
+MAX_TRIES = 64  # places that look like a message and are looked at, within another or after damage
+MAX_SWALLOWED_MESSAGES = 50_000  # messages that one may have swallowed, at most, to be found out
 
 
 class Gap(NamedTuple):
@@ -83,8 +83,8 @@ def salvaged(data: bytes, declared: Declared, index: Mapping[int, tuple[int, int
 
 def swallowed(data: bytes, start: int, end: int, declared: Declared) -> int | None:
     """Where within a message the first of other messages begins that lead to its very end."""
-    steps = CHAIN
-    for _ in range(TRIES):
+    steps = MAX_SWALLOWED_MESSAGES
+    for _ in range(MAX_TRIES):
         match = MESSAGE_START.search(data, start, end)
         if match is None:
             break
@@ -110,24 +110,24 @@ def declare(declared: Declared, opcode: int, body: bytes, end: int) -> str:
         end: of the record, that is believed whatever the body holds.
 
     Returns:
-        What was wrong and costs nothing, in words; or ''.
+        A note about what was wrong and costs nothing; or ''.
 
     Raises:
         Damage: it cannot be read, and nothing else declares it.
     """
     note = declared.schema if opcode == SCHEMA else declared.channel
-    words = 'a schema' if opcode == SCHEMA else 'a channel'
+    kind = 'a schema' if opcode == SCHEMA else 'a channel'
     try:
         note(Fields(body))
     except Damage as damage:
         try:
             if (mended := _mended(opcode, body)) is not None:
                 note(Fields(mended))
-                return f'{words} has a wrong length within'
+                return f'{kind} has a wrong length within'
         except Damage:
             pass
         if declared.knows(opcode, int.from_bytes(body[:2], 'little')):
-            return f'{words} cannot be read ({damage.fault}), and is declared elsewhere'
+            return f'{kind} cannot be read ({damage.fault}), and is declared elsewhere'
         raise Damage(damage.fault, end=end) from damage
     return ''
 
@@ -171,12 +171,12 @@ def _record(data: bytes, at: int, declared: Declared, evidence: Evidence,
             end = evidence.declaration_end(at, opcode, length)
             note = note or 'a declaration in a chunk has a wrong length' * (
                 end != at + HEAD.size + length)
-        words = declare(declared, opcode, data[at + HEAD.size:end], end)
-        return end, None, note or words
+        own = declare(declared, opcode, data[at + HEAD.size:end], end)
+        return end, None, note or own
     following = evidence.anchor(at + 1)
     over = end > len(data) or following is not None and end > following
     if over or opcode in NEVER_IN_CHUNKS or at in index or not sure and (
-            opcode < UNKNOWN or not evidence.begins(end)):
+            opcode < FIRST_UNKNOWN_OPCODE or not evidence.begins(end)):
         raise Damage(f'a chunk holds a record of kind {opcode} with {length} bytes')
     return end, None, note
 
@@ -228,7 +228,7 @@ def _next(data: bytes, at: int, evidence: Evidence) -> int:
     anchor = evidence.anchor(at)
     top = len(data) if anchor is None else anchor
     place = at
-    for _ in range(TRIES):
+    for _ in range(MAX_TRIES):
         match = DECLARATION_START.search(data, place, top)
         if match is None:
             break
@@ -238,7 +238,7 @@ def _next(data: bytes, at: int, evidence: Evidence) -> int:
         place = match.start() + 1
     if evidence.anchors:
         return top
-    for _ in range(TRIES):
+    for _ in range(MAX_TRIES):
         match = MESSAGE_START.search(data, at, top)
         if match is None:
             break

@@ -21,8 +21,9 @@ from vn_nav.bags.storage.records import BagError, Connection, Message
 __all__ = ['METADATA', 'UNLISTED', 'Bag', 'BagError', 'Connection', 'Decoded', 'Loss', 'Message',
            'Topic', 'in_time_order', 'load_yaml', 'messages', 'summary']
 
-ORDER_WINDOW = 1_000_000_000  # ns by which recorders write a message late, at most
-MAX_HELD = 64 << 20  # bytes that wait to be put in order: two seconds of raw 640 x 480 at 30 Hz
+ORDER_WINDOW_NS = 1_000_000_000  # ns by which recorders write a message late, at most
+# Two seconds of raw 640 x 480 at 30 Hz may wait to be put in order.
+MAX_HELD_BYTES = 64 << 20
 
 
 class Topic(NamedTuple):
@@ -47,7 +48,7 @@ class Bag:
 
     Args:
         path: a rosbag2 folder or an MCAP file.
-        strict: damage is an error. Otherwise it is passed over; `losses` and `missing` tell of it
+        strict: damage is an error. Otherwise it is passed over; `losses` and `missing` list it
             after reading.
 
     Attributes:
@@ -124,7 +125,7 @@ class Bag:
                       ) -> Iterator[Message]:
         """The messages by the time of recording, as playing a bag has them; see `in_time_order`.
 
-        Where the files have an index the order is exact, within `MAX_HELD`.
+        Where the files have an index the order is exact, within `MAX_HELD_BYTES`.
         """
         return in_time_order(self.messages(topics), ahead=self._ahead, clocks=clocks)
 
@@ -187,7 +188,8 @@ def summary(bag: str | Path) -> dict[str, Topic]:
     return Bag(bag).topics()
 
 
-def in_time_order(stream: Iterable[Message], window: int = ORDER_WINDOW, limit: int = MAX_HELD,
+def in_time_order(stream: Iterable[Message], window: int = ORDER_WINDOW_NS,
+                  limit: int = MAX_HELD_BYTES,
                   ahead: Callable[[], int | None] = lambda: None, clocks: Iterable[str] = ()
                   ) -> Iterator[Message]:
     """Messages by the time of recording.

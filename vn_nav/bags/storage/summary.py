@@ -20,8 +20,8 @@ from vn_nav.bags.storage.records import (
     FOOTER,
     HEAD,
     HEADER,
-    MAX_DECLARED,
-    MAX_TIME,
+    MAX_DECLARED_BYTES,
+    MAX_TIME_NS,
     MESSAGE,
     MESSAGE_INDEX,
     METADATA,
@@ -35,7 +35,7 @@ from vn_nav.bags.storage.records import (
 
 MAGIC = b'\x89MCAP0\r\n'
 READ_BYTES = 1 << 20  # bytes that are read at a time
-MAX_SETS = 1 << 16  # sets of channels, and numbers in them, that are told apart
+MAX_SETS = 1 << 16  # sets of channels, and numbers in them, that are distinguished
 _NEVER = (0, HEADER, FOOTER, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
 _FOOTER = struct.Struct('<BQQQI')  # head, start of the summary, of its offsets, CRC
 _TAIL = _FOOTER.size + len(MAGIC)
@@ -62,8 +62,8 @@ class Chunks:
     @property
     def start(self) -> int | None:
         """When the first message was recorded [ns]; None: unknown."""
-        first = min(self._starts, default=MAX_TIME)
-        return None if first == MAX_TIME else first
+        first = min(self._starts, default=MAX_TIME_NS)
+        return None if first == MAX_TIME_NS else first
 
     def add(self, offset: int, first: int, held: frozenset[int]) -> None:
         """Note a chunk: its place, the time [ns] of its first message, its channels if known."""
@@ -74,7 +74,7 @@ class Chunks:
             if len(self._numbers) < MAX_SETS and self._members <= MAX_SETS:
                 number = self._numbers[held] = len(self._numbers)
         self._offsets.append(offset)
-        self._starts.append(min(first, MAX_TIME))
+        self._starts.append(min(first, MAX_TIME_NS))
         self._sets.append(number)
 
     def sort(self) -> None:
@@ -89,7 +89,7 @@ class Chunks:
         """Pass over chunks of these channels alone from now on; whether there is one."""
         self._skipped = frozenset(number for held, number in self._numbers.items()
                                   if held and held.issubset(unwanted))
-        earliest, ahead = MAX_TIME, array('Q')
+        earliest, ahead = MAX_TIME_NS, array('Q')
         for number, first in zip(reversed(self._sets), reversed(self._starts), strict=True):
             if number not in self._skipped:
                 earliest = min(earliest, first)
@@ -169,8 +169,9 @@ class Summary:
             if at_record > at or opcode in _NEVER:
                 raise Damage(f'the summary holds a record of kind {opcode}, {length} bytes')
             if opcode in (SCHEMA, CHANNEL, STATISTICS, CHUNK_INDEX):
-                if length > MAX_DECLARED:
-                    raise Damage(f'a record of the summary has more than {MAX_DECLARED} bytes')
+                if length > MAX_DECLARED_BYTES:
+                    raise Damage('a record of the summary has more than '
+                                 f'{MAX_DECLARED_BYTES} bytes')
                 self._record(opcode, Fields(file.read(length)))
             else:
                 file.seek(at_record)
@@ -210,7 +211,7 @@ class Summary:
         else:
             first, last, offset, _ = fields.numbers('<QQQQ')
             held = frozenset(k for k, _ in struct.iter_unpack('<HQ', pairs(fields)))
-            self.chunks.add(offset, first if first <= last else MAX_TIME, held)
+            self.chunks.add(offset, first if first <= last else MAX_TIME_NS, held)
 
 
 def peek(file: BinaryIO, at: int, size: int) -> bytes:

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import errno
-import functools
 import os
-import textwrap
 import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
-
-from vn_msgs_py.topics import BEST_EFFORT, LATCHED, Topic
+from vn_msgs_py.topics import Topic
 from vn_nav.bags.storage.definitions import definition
-from vn_nav.bags.storage.output import CHUNK, McapOutput
+from vn_nav.bags.storage.metadata import (
+    RecordedChannel,
+    RecordedFile,
+    file_text,
+    metadata_text,
+    qos_text,
+)
+from vn_nav.bags.storage.output import CHUNK_BYTES, McapOutput
 from vn_nav.errors import UserError
 
 FLUSH_PERIOD_S = 1.0  # s between flushes: what a power cut may cost
@@ -26,7 +28,6 @@ MIN_FREE_BYTES = 1_000_000_000  # bytes
 MAX_WAITING_BYTES = 64 << 20  # bytes that may wait for the disk before `write` does
 # To the flush after the first message of a topic, so that metadata.yaml names it.
 FIRST_FLUSH_S = 0.1
-_FOREVER = {'sec': 9223372036, 'nsec': 854775807}  # as Jazzy writes a duration without end
 
 
 class RecordingStopped(UserError):
@@ -37,41 +38,20 @@ class RecordingStopped(UserError):
                          f'{folder} is whole up to here: free some space and begin another bag')
 
 
-@dataclasses.dataclass(frozen=True)
-class _Channel:
-    """A topic as the bag has it."""
-
-    name: str
-    topic: Topic
-    definition: str
-    digest: str  # RIHS01
-
-
 class _Waiting(NamedTuple):
-    channel: _Channel
+    channel: RecordedChannel
     data: bytes
     stamp: int
     sequence: int
 
 
-@dataclasses.dataclass
-class _File:
-    """A file of the bag as metadata.yaml has it."""
-
-    name: str
-    span: tuple[int, int] | None = None  # least and greatest stamp
-    counts: collections.Counter[_Channel] = dataclasses.field(default_factory=collections.Counter)
-    text: str = ''  # once it is finished
-
-
 class BagWriter:
     """A bag being recorded; a context manager.
 
-    A thread of its own compresses and writes, so that a slow disk does not hold up who calls. It
-    writes what has come every second, also to the disk itself and with a metadata.yaml that counts
-    it, and every full chunk at once. When
-    less than `min_free` is left, or writing fails, it finishes the bag and `stopped` says why.
-    A topic is in the bag from its first message on.
+    A thread of its own compresses and writes: a slow disk does not hold up the caller. Every full
+    chunk is written at once. What has come is written every second, synchronised with the disk,
+    and counted in metadata.yaml. When less than `min_free` is left, or writing fails, the thread
+    finishes the bag, and `stopped` says why. A topic is in the bag from its first message on.
 
     Args:
         folder: of the bag; it must not exist. Its files are FOLDER_0.mcap, FOLDER_1.mcap...
@@ -88,14 +68,15 @@ class BagWriter:
                  max_seconds: float = 0.0, min_free: int = MIN_FREE_BYTES):
         self.folder = Path(folder)
         self._max_bytes, self._max_seconds, self._min_free = max_bytes, max_seconds, min_free
-        self.stopped = ''  # why, in words
+        self.stopped = ''  # why; empty: it goes on
         # By name in the bag; another counter every second.
         self.written: collections.Counter[str] = collections.Counter()
-        self._added: dict[str, _Channel] = {}
+        self._added: dict[str, RecordedChannel] = {}
         for topic in topics:
             self.add(topic)
-        self._files: list[_File] = []
-        self._before: collections.Counter[_Channel] = collections.Counter()  # in finished files
+        self._files: list[RecordedFile] = []
+        # In finished files.
+        self._before: collections.Counter[RecordedChannel] = collections.Counter()
         self._file: McapOutput | None = None
         self._queue: collections.deque[_Waiting] = collections.deque()
         self._bytes = 0  # in the queue
@@ -125,7 +106,7 @@ class BagWriter:
             UserError: its type is unknown.
         """
         name = topic.name if topic.name.startswith('/') else f'/{topic.name}'
-        self._added[topic.name] = _Channel(name, topic, *definition(topic.type))
+        self._added[topic.name] = RecordedChannel(name, topic, *definition(topic.type))
 
     def write(self, name: str, data: bytes, stamp: int, sequence: int = 0) -> None:
         """Append one CDR message of a topic; it is not copied. Waits where the disk is slow.
@@ -176,7 +157,7 @@ class BagWriter:
 
     def _work(self) -> None:
         """The thread: never raises."""
-        self._due, told = time.monotonic() + FLUSH_PERIOD_S, 0
+        self._due, counted = time.monotonic() + FLUSH_PERIOD_S, 0
         try:
             while (item := self._take(self._due)) or not self._closing:
                 if item:
@@ -186,7 +167,7 @@ class BagWriter:
                     self._present.sync()
                     self._count()
                     self._check_room()
-                    if told != (told := self.written.total()):
+                    if counted != (counted := self.written.total()):
                         self._write_metadata()
                     self._due = time.monotonic() + FLUSH_PERIOD_S
             self._present.flush()
@@ -195,7 +176,7 @@ class BagWriter:
         try:
             # What metadata.yaml takes has to be free still when the file is finished.
             if self._file is not None:
-                self._end_file(spare=len(self._describe()) + 8192 if self.stopped else 0)
+                self._end_file(spare=len(self._metadata()) + 8192 if self.stopped else 0)
         except Exception as error:
             self._stop(error)
 
@@ -219,7 +200,7 @@ class BagWriter:
 
     def _put(self, item: _Waiting) -> None:
         self._unchecked += len(item.data)
-        if self._unchecked >= CHUNK:
+        if self._unchecked >= CHUNK_BYTES:
             self._check_room()
         if self._channels and (
                 0 < self._max_bytes <= self._present.size
@@ -231,17 +212,17 @@ class BagWriter:
         if channel not in self._channels:
             self._channels[channel] = self._present.channel(
                 channel.name, channel.topic.type, channel.definition,
-                {'offered_qos_profiles': _yaml([_quality(channel.topic)]),
+                {'offered_qos_profiles': qos_text(channel.topic),
                  'topic_type_hash': channel.digest})
             self._due = min(self._due, time.monotonic() + FIRST_FLUSH_S)
         self._present.add(self._channels[channel], item.data, item.stamp, item.sequence)
 
     def _stop(self, error: Exception) -> None:
-        # Not every OSError has a number and words of the system.
-        words = ((error.strerror if isinstance(error, OSError) else None)
-                 or f'{type(error).__name__}: {error}')
+        # Not every OSError has a number and a text of the system.
+        reason = ((error.strerror if isinstance(error, OSError) else None)
+                  or f'{type(error).__name__}: {error}')
         with self._change:
-            self.stopped = self.stopped or words
+            self.stopped = self.stopped or reason
             self._queue.clear()
             self._change.notify_all()
 
@@ -256,8 +237,8 @@ class BagWriter:
     def _begin_file(self) -> None:
         path = self.folder / f'{self.folder.name}_{len(self._files)}.mcap'
         self._file, self._begun = McapOutput(path), time.monotonic()
-        self._channels: dict[_Channel, int] = {}  # ids in the present file
-        self._files.append(_File(path.name))
+        self._channels: dict[RecordedChannel, int] = {}  # ids in the present file
+        self._files.append(RecordedFile(path.name))
         self._write_metadata(folder=True)
 
     def _end_file(self, spare: int = 0) -> None:
@@ -267,7 +248,7 @@ class BagWriter:
             self._count()
             self._file = None
             ended = self._files[-1]
-            ended.text = _file_text(ended)
+            ended.text = file_text(ended)
             self._before += ended.counts
         self._write_metadata(folder=True)
 
@@ -283,7 +264,7 @@ class BagWriter:
             written[channel.name] += count
         self.written = written
 
-    def _counts(self) -> collections.Counter[_Channel]:
+    def _counts(self) -> collections.Counter[RecordedChannel]:
         present = self._files[-1]
         return self._before + (collections.Counter() if present.text else present.counts)
 
@@ -297,7 +278,7 @@ class BagWriter:
         partial = path.with_suffix('.yaml.tmp')
         try:
             with open(partial, 'w', encoding='utf-8') as file:
-                file.write(self._describe())
+                file.write(self._metadata())
                 file.flush()
                 os.fsync(file.fileno())
             partial.replace(path)
@@ -311,69 +292,5 @@ class BagWriter:
             finally:
                 os.close(names)
 
-    def _describe(self) -> str:
-        """The text of metadata.yaml (rosbag2_storage, metadata version 9).
-
-        Written every second: what stays the same is text already, as a dumper would take a
-        hundred times as long.
-        """
-        spans = [file.span for file in self._files if file.span]
-        span = (min(first for first, _ in spans),
-                max(last for _, last in spans)) if spans else None
-        counts = self._counts()
-        topics = [f'{_topic_text(channel)}      message_count: {count}\n'
-                  for channel, count in counts.items()]
-        return ''.join((
-            'rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: mcap\n',
-            _times_text(span, '  '), f'  message_count: {counts.total()}\n',
-            '  topics_with_message_count:', '\n' if topics else ' []\n', *topics,
-            # Of chunks: rosbag2 leaves that to MCAP.
-            "  compression_format: ''\n  compression_mode: ''\n", '  relative_file_paths:\n',
-            *(f'    - {_scalar(file.name)}\n' for file in self._files), '  files:\n',
-            *(file.text or _file_text(file) for file in self._files),
-            '  custom_data: null\n  ros_distro: jazzy\n'))
-
-
-class _NoAliases(yaml.SafeDumper):
-    """Repeats equal parts, as rosbag2 does, instead of referring to the first."""
-
-    def ignore_aliases(self, data):
-        return True
-
-
-def _yaml(data: object) -> str:
-    return yaml.dump(data, Dumper=_NoAliases, sort_keys=False, width=1000)
-
-
-@functools.cache
-def _scalar(text: str) -> str:
-    """A text as YAML has it, in quotes where it needs them."""
-    return _yaml([text]).removeprefix('- ').strip()
-
-
-@functools.cache
-def _topic_text(channel: _Channel) -> str:
-    return textwrap.indent(_yaml([{'topic_metadata': {
-        'name': channel.name, 'type': channel.topic.type, 'serialization_format': 'cdr',
-        'offered_qos_profiles': [_quality(channel.topic)],
-        'type_description_hash': channel.digest}}]), '    ')
-
-
-def _file_text(file: _File) -> str:
-    return (f'    - path: {_scalar(file.name)}\n{_times_text(file.span, "      ")}'
-            f'      message_count: {file.counts.total()}\n')
-
-
-def _times_text(span: tuple[int, int] | None, indent: str) -> str:
-    first, last = span or (0, 0)
-    return (f'{indent}duration:\n{indent}  nanoseconds: {last - first}\n'
-            f'{indent}starting_time:\n{indent}  nanoseconds_since_epoch: {first}\n')
-
-
-def _quality(topic: Topic) -> dict:
-    """The QoS of a topic as rosbag2 writes it."""
-    return {'history': 'keep_last', 'depth': topic.depth,
-            'reliability': 'best_effort' if topic.reliability == BEST_EFFORT else 'reliable',
-            'durability': 'transient_local' if topic.durability == LATCHED else 'volatile',
-            'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
-            'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False}
+    def _metadata(self) -> str:
+        return metadata_text(self._files, self._counts())

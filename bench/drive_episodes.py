@@ -1,0 +1,193 @@
+"""The last stage of teach_and_drive.py: episodes to pictures out of the bag."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+from record_drive import RecordedDrive, bridge_parameters, read_drive, write_figures
+
+from vn_nav.arrival import arrived
+from vn_nav.cli.demo import LINE
+from vn_nav.cli.world import machine
+from vn_nav.errors import UserError
+from vn_nav.evaluation.bag_episodes import drives_from_bag
+from vn_nav.evaluation.evaluator import ARRIVAL, DECLARED, STOP_THRESHOLD
+from vn_nav.evaluation.metrics import Episode, summarise
+from vn_nav.nodes.processes import Processes, ProcessFailure
+from vn_nav.observation import preprocess
+from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.report.tables import print_rows
+from vn_nav.robot import DRIVE_ACTIONS, load_robot
+from vn_nav.scenes import house_scene
+from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.houses.viewpoints import VIEW, interest
+from vn_sim_bridge.render.randomisation import load_randomisation
+from vn_sim_bridge.robot.goal_pictures import GoalPicture, load_goal_pictures, save_goal_pictures
+from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
+from vn_sim_bridge.simulators.house import HouseSimulator
+
+BEFORE, AFTER, WRONG, RANDOM = ROWS = ('before', 'after', 'wrong picture', 'random actions')
+DRIVEN = ['odom', 'ground_truth/odom', 'cmd_vel', 'action', 'action_names', 'arrived', 'collision',
+          'reward', 'episode_end', 'episode', 'episode_result', 'scene', '/diagnostics']
+RIGHT, OTHER = 'right', 'other'  # folders of goal pictures
+MAX_SILENCE_S = 180.0  # without a finished episode
+DRIVE_SEED = 2026
+CHOICE = 8  # pictures of the bag; the one that shows most becomes a goal
+
+
+def drive(options) -> None:
+    """Episodes to pictures out of the bag, a row each."""
+    out = options.out
+    folders = {RIGHT: out / 'goals', OTHER: out / 'other_goals'}
+    goals = choose_goals(options, read_drive(out / 'bag'))
+    save_goal_pictures(folders[RIGHT], goals)
+    # Each pose with the picture of another place.
+    save_goal_pictures(folders[OTHER], wrong_pictures(goals))
+    episodes = {}
+    for row in options.rows:
+        shown = folders[OTHER if row == WRONG else RIGHT]
+        checkpoint = options.checkpoint if row == BEFORE else out / 'taught' / 'checkpoint'
+        if row == RANDOM:
+            episodes[row] = without_ros(options, None, [])
+        elif options.without_ros:
+            policy = PolicyRuntime(checkpoint, seed=options.seed,
+                                   stop_threshold=_threshold(options, checkpoint))
+            episodes[row] = without_ros(options, policy, load_goal_pictures(shown))
+        else:
+            episodes[row] = over_ros(options, row, checkpoint, shown)
+        print_rows({options.stop: {row: summarise(episodes[row])}}, f'house {options.house}')
+    figures = {row: summarise(own) for row, own in episodes.items()}
+    parts = {name: json.loads(path.read_text()) for name in ('record', 'teach')
+             if (path := out / f'{name}.json').is_file()}
+    write_figures(out / 'result.json', {'stop': options.stop, 'rows': figures, **parts,
+                                        'checkpoint': str(options.checkpoint),
+                                        'machine': machine()})
+    print_rows({options.stop: figures}, f'house {options.house}, pictures out of the bag')
+
+
+def choose_goals(options, shown: RecordedDrive) -> list[GoalPicture]:
+    """Pictures of the bag, each the most interesting of a few that were drawn at random."""
+    rng = np.random.default_rng(DRIVE_SEED)
+    house = generate_house(options.house, rooms=options.rooms)
+    backend = HouseSimulator([house], [0], robot=load_robot(options.out / 'robot.yaml'), size=VIEW)
+    drawn = rng.permutation(len(shown.pictures))[:CHOICE * options.goals]
+    if len(drawn) < CHOICE * options.goals:
+        raise UserError(f'a bag holds {CHOICE} pictures for every goal',
+                        f'{len(shown.pictures)} for {options.goals} goals', 'lower --goals')
+    poses = np.column_stack([shown.pictured[drawn], np.zeros(len(drawn))])
+    frames = backend.view(np.zeros(len(drawn), np.int64), poses)
+    best = interest(frames.depth, frames.instances).reshape(options.goals, CHOICE).argmax(1)
+    chosen = drawn.reshape(options.goals, CHOICE)[np.arange(options.goals), best]
+    return [GoalPicture(shown.pictures[k], tuple(shown.pictured[k])) for k in chosen]
+
+
+def wrong_pictures(goals: list[GoalPicture]) -> list[GoalPicture]:
+    """The same poses, each with the picture that was taken farthest from there."""
+    places = np.array([goal.pose[:2] for goal in goals])
+    gaps = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
+    return [GoalPicture(goals[int(far)].picture, goal.pose)
+            for goal, far in zip(goals, gaps.argmax(axis=1), strict=True)]
+
+
+def over_ros(options, row: str, checkpoint: Path, goals: Path) -> list[Episode]:
+    """Episodes of a policy: bridge, policy and recorder as processes, counted from the bag."""
+    name, robot = row.replace(' ', '_'), str(options.out / 'robot.yaml')
+    bag = options.out / f'drive_{name}'
+    shutil.rmtree(bag, ignore_errors=True)
+    processes = Processes(options.out / 'logs')
+    bridge, policy = f'bridge_{name}', f'policy_{name}'
+    try:
+        processes.start('recorder', 'vn_nav.nodes.recorder_node',
+                        {'output': str(bag), 'topics': DRIVEN})
+        processes.start(bridge, 'vn_sim_bridge.bridge_node', {
+            **bridge_parameters(options), 'goals': str(goals), 'seed': options.seed,
+            'stop': options.stop, 'episodes': options.episodes, 'exit_when_done': True})
+        processes.start(policy, 'vn_nav.nodes.policy_node', {
+            'checkpoint': str(checkpoint), 'robot': robot, 'time': 'lock_step',
+            'auto_enable': True, 'seed': options.seed,
+            'stop_threshold': _threshold(options, checkpoint)})
+        _wait(processes, bridge, policy, options.episodes)
+    finally:
+        processes.stop_all()
+    (drive,) = drives_from_bag(bag)
+    if len(drive.episodes) != options.episodes:
+        raise SystemExit(f'{bag} holds {len(drive.episodes)} episodes of {options.episodes}')
+    return [recorded.episode for recorded in drive.episodes]
+
+
+def _threshold(options, checkpoint: Path) -> float:
+    """Of `arrival`, from which on the policy stops by itself; 1: never."""
+    own = load_checkpoint(checkpoint).info['stop_threshold']
+    return 1.0 if options.stop == ARRIVAL else STOP_THRESHOLD if own is None else own
+
+
+def _wait(processes: Processes, bridge: str, policy: str, count: int) -> None:
+    """Until the bridge has run its episodes."""
+    done, progress = 0, time.monotonic()
+    while processes.running[bridge].poll() is None:
+        for name in ('recorder', bridge, policy):
+            processes.check(name)
+        if (now := len(LINE.findall(processes.log(bridge)))) > done:
+            done, progress = now, time.monotonic()
+            if done % 10 == 0:
+                print(f'{bridge}: {done} episodes of {count}', flush=True)
+        if time.monotonic() - progress > MAX_SILENCE_S:
+            raise ProcessFailure(f'no episode ended for {MAX_SILENCE_S:.0f} s')
+        time.sleep(0.2)
+    processes.check(bridge)
+
+
+def without_ros(options, policy: PolicyRuntime | None, pictures: list[GoalPicture]
+                ) -> list[Episode]:
+    """The same starts and goals in the same robot, without ROS.
+
+    Args:
+        policy: None: random actions.
+        pictures: shown, one for each goal.
+    """
+    spec = load_robot(options.out / 'robot.yaml').with_actions(DRIVE_ACTIONS)
+    goals = load_goal_pictures(options.out / 'goals')
+    robot = SimulatedRobot(
+        house_scene(options.house, options.rooms), robot=spec, size=options.size,
+        seed=options.seed, stop=options.stop,
+        randomisation=load_randomisation(options.randomisation),
+        goal_poses=[goal.pose for goal in goals])
+    rng, deltas = np.random.default_rng(options.seed), np.column_stack([
+        np.array(spec.moves), np.zeros(len(spec.actions))])
+    declares = options.stop == DECLARED
+
+    def choose() -> int:
+        if policy is None:
+            return int(rng.integers(len(deltas) + declares))
+        picture = np.ascontiguousarray(robot.observe().rgb[0].transpose(1, 2, 0))
+        action = policy.act(preprocess(picture, policy.size))
+        return len(deltas) if declares and policy.arrived else action
+    found = []
+    for index in range(options.episodes):
+        episode, seconds, reached = robot.begin_episode(index), 0.0, False
+        if policy is not None:
+            policy.set_goal(preprocess(pictures[episode.goal].picture, policy.size))
+        while True:
+            action = choose()
+            if action == len(deltas):
+                decision = robot.declare()
+            else:
+                seconds += spec.nominal_duration(action)
+                robot.tick(deltas[action] / TICK)
+                decision = robot.tick(np.zeros(4))
+            reached |= bool(arrived(decision.distance, decision.heading_error))
+            if decision.end:
+                break
+        found.append(Episode(
+            success=decision.success, start_distance=episode.start_distance,
+            path_length=episode.path_length, decisions=episode.decisions,
+            collisions=episode.collisions, seconds=seconds, stop_distance=decision.distance,
+            stop_heading=decision.heading_error, reward=float(decision.success),
+            declared=None if options.stop == ARRIVAL else decision.end != TRUNCATED,
+            reached=reached))
+    return found

@@ -1,0 +1,228 @@
+"""Decodes the steps of a bag: pictures scaled in threads, arrays that grow on disk."""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import contextlib
+import dataclasses
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from vn_msgs_py.camera import field_of_view
+from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
+from vn_nav.bags.dataset import MAX_DEPTH, Wanted
+from vn_nav.bags.drive import Frame, Report, find_topics, synchronise, timestamped_messages
+from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter, Step
+from vn_nav.bags.storage.stream import messages, summary
+from vn_nav.errors import UserError
+from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
+
+FORMAT = 2  # of the files; another one is decoded anew
+INDEX = 'index.json'
+# Pictures in the decoders at once: bounds the memory.
+MAX_PICTURES_IN_FLIGHT = 64
+
+
+def decoded(steps: Iterable[Step], wanted: Wanted, fov: float | None
+            ) -> Iterator[tuple[Step, dict[str, np.ndarray] | None]]:
+    """Steps with their pictures, in order; None where a picture cannot be decoded.
+
+    Decoding and scaling run in `wanted.threads` threads of their own: OpenCV releases the
+    interpreter meanwhile. At most `MAX_PICTURES_IN_FLIGHT` steps are held.
+    """
+    pool = concurrent.futures.ThreadPoolExecutor(wanted.threads)
+    flying: collections.deque = collections.deque()
+    try:
+        for step in steps:
+            flying.append((step, pool.submit(_pictures, step.frame, wanted, fov)))
+            if len(flying) >= MAX_PICTURES_IN_FLIGHT:
+                step, future = flying.popleft()
+                yield step, future.result()
+        while flying:
+            step, future = flying.popleft()
+            yield step, future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def read_steps(bag: str | Path, wanted: Wanted, report: Report) -> tuple[Iterator[Step], dict]:
+    """The steps of a bag as they stream by, pictures not yet decoded, and facts of its camera.
+
+    Returns:
+        The steps; and `topics` (as they are in the bag) and `fov` (rad, of the shorter side;
+        None: the bag has no camera_info).
+    """
+    topics = find_topics(bag, wanted.topics)
+    fov = _field_of_view(bag, topics.camera_info)
+    if fov is not None:
+        crop_fraction(fov, wanted.robot.camera_fov)  # or says that the camera is too narrow
+    frames = synchronise(timestamped_messages(bag, topics), topics, report)
+    steps = (_each(frames) if wanted.every else ActionSegmenter(wanted.robot, report).cut(frames))
+    return steps, {'topics': dataclasses.asdict(topics), 'fov': fov}
+
+
+def _each(frames) -> Iterator[Step]:
+    for frame in frames:
+        yield Step(frame, NO_ACTION, False)
+
+
+def _pictures(frame, wanted: Wanted, fov: float | None) -> dict[str, np.ndarray] | None:
+    """What the arrays of a step hold of pictures; depth and labels only if they can be read."""
+    lens = {} if fov is None else {'fov': fov, 'target_fov': wanted.robot.camera_fov}
+    try:
+        smallest = needed_side(wanted.size, **lens)
+        shown = {'image': preprocess(decode_rgb(frame.image, smallest), wanted.size, **lens)}
+    except ImageError:
+        return None
+    with contextlib.suppress(ImageError):
+        if frame.depth is not None:
+            depth = preprocess_map(decode_depth(frame.depth), wanted.size, **lens)
+            shown['depth'] = np.where(np.isfinite(depth), np.clip(
+                np.nan_to_num(depth) * (255 / MAX_DEPTH), 1, 255), 0).astype(np.uint8)
+    with contextlib.suppress(ImageError):
+        if frame.labels is not None:
+            shown['labels'] = preprocess_map(decode_labels(frame.labels), wanted.size, **lens)
+    return shown
+
+
+def _field_of_view(bag: str | Path, topic: str) -> float | None:
+    """Of the shorter side [rad], by the first camera_info; None where there is none."""
+    if not topic:
+        return None
+    for message in messages(bag, (topic,)):
+        info = message.message
+        focal = float(info.k[0])
+        if focal > 0 and info.width > 0 and info.height > 0:
+            return field_of_view(info.width, info.height, focal)
+        break
+    return None
+
+
+class _Columns:
+    """Arrays that grow on disk, row by row."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._files: dict[str, BinaryIO] = {}
+        self._layout: dict[str, dict[str, Any]] = {}
+
+    def append(self, name: str, row: np.ndarray) -> None:
+        if name not in self._files:
+            self._files[name] = open(self._folder / f'{name}.bin', 'wb')
+            self._layout[name] = {'dtype': row.dtype.str, 'shape': [0, *row.shape]}
+        layout = self._layout[name]
+        if layout['shape'][1:] != list(row.shape) or layout['dtype'] != row.dtype.str:
+            raise UserError(f'{name} of a bag have one shape and type',
+                            f'{row.dtype} {row.shape}', 'split the bag where the camera changes')
+        self._files[name].write(np.ascontiguousarray(row).tobytes())
+        layout['shape'][0] += 1
+
+    def close(self) -> dict:
+        for file in self._files.values():
+            file.flush()
+            os.fsync(file.fileno())
+            file.close()
+        return self._layout
+
+
+def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], None]) -> None:
+    """Decode the steps of a bag into arrays and an index in a folder."""
+    report, columns = Report(), _Columns(folder)
+    steps, facts = read_steps(bag, wanted, report)
+    optional = {name: _Optional(name) for name in ('depth', 'labels') if facts['topics'][name]}
+    goals: dict[bytes, int] = {}
+    shown_goal, number, bad, unseen = None, -1, 0, 0
+    rows: list[list[float]] = []
+    held = summary(bag)[facts['topics']['image']].count or math.inf
+    for step, pictures in decoded(steps, wanted, facts['fov']):
+        show(report.pictures / held)
+        frame = step.frame
+        if pictures is None:
+            bad += 1
+            if rows and rows[-1][2] == frame.episode:
+                rows[-1][1] = NO_ACTION  # where that action led to was not seen
+            continue
+        if frame.goal is not shown_goal:
+            shown_goal = frame.goal
+            number = _keep_goal(shown_goal, wanted, facts['fov'], columns, goals)
+            unseen += number < 0 and shown_goal is not None
+        rows.append([frame.stamp, step.action, frame.episode, number, *frame.pose])
+        columns.append('image', pictures['image'])
+        for name, counted in optional.items():
+            counted.look(frame, pictures)
+            missing = np.zeros((wanted.size, wanted.size), np.uint8)
+            columns.append(name, pictures.get(name, missing).astype(np.uint8))
+        columns.append('beside', np.array(['depth' in pictures, 'labels' in pictures]))
+    if not rows:
+        raise UserError('a bag for learning holds pictures with matching poses',
+                        f'{bag}: {report.pictures} pictures, {report.without_pose} without a '
+                        f'pose, {bad} that cannot be decoded', 'see `vn_nav bag doctor`')
+    np.save(folder / 'rows.npy', np.array(rows, np.float64))
+    facts |= {
+        'bag': str(bag), 'pictures': report.pictures, 'without_pose': report.without_pose,
+        'unordered': report.unordered, 'undecodable': bad, 'bad_motion': report.bad,
+        'jumps': report.jumps, 'set_back': report.set_back, 'episodes': report.episodes,
+        'misfits': report.misfits, 'misfit_share': report.misfit_share,
+        'actions': {wanted.robot.action_names[k]: n for k, n in sorted(report.actions.items())}}
+    facts['notes'] = [note for counted in optional.values() if (note := counted.summary())]
+    if unseen:
+        facts['notes'].append(f'{unseen} goal picture{"s" * (unseen > 1)} cannot be decoded')
+    index = {'format': FORMAT, 'columns': columns.close(), 'facts': facts}
+    (folder / INDEX).write_text(json.dumps(index, indent=1))
+
+
+class _Optional:
+    """Pictures of depth or of labels that come with the camera's, and why some are not there."""
+
+    def __init__(self, role: str):
+        self._role, self._decode = role, decode_depth if role == 'depth' else decode_labels
+        self._all = self._missing = self._unreadable = 0
+        self._why = ''
+
+    def look(self, frame: Frame, pictures: dict[str, np.ndarray]) -> None:
+        self._all += 1
+        message = getattr(frame, self._role)
+        self._missing += message is None
+        if message is None or self._role in pictures:
+            return
+        self._unreadable += 1
+        if not self._why:
+            try:
+                self._decode(message)
+            except ImageError as error:
+                self._why = str(error)
+
+    def summary(self) -> str:
+        """That they are left out, and why; empty: they are all there."""
+        faults = []
+        if self._missing:
+            faults.append(f'{self._missing:,} of {self._all:,} pictures have none within 50 ms')
+        if self._unreadable:
+            faults.append(f'{self._unreadable:,} of {self._all:,} cannot be read: {self._why}')
+        return f'{self._role} left out: {"; ".join(faults)}' if faults else ''
+
+
+def _keep_goal(message: Any, wanted: Wanted, fov: float | None, columns: _Columns,
+               goals: dict[bytes, int]) -> int:
+    """Number of a goal picture, which is kept once; -1: it is none, or cannot be decoded."""
+    lens = {} if fov is None else {'fov': fov, 'target_fov': wanted.robot.camera_fov}
+    try:
+        picture = None if message is None else decode_rgb(message)
+    except ImageError:
+        picture = None
+    if picture is None:
+        return -1
+    picture = preprocess(picture, wanted.size, **lens)
+    digest = hashlib.sha256(picture.tobytes()).digest()
+    if digest not in goals:
+        goals[digest] = len(goals)
+        columns.append('goals', picture)
+    return goals[digest]
