@@ -59,6 +59,28 @@ class World:
                       self.radius)
 
 
+def move_among(rects: np.ndarray, radius: float, poses: np.ndarray, delta: np.ndarray,
+               env_ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Displace robots that are all in one place, as `World.move` does.
+
+    Args:
+        rects: [M,4] x0, y0, x1, y1 [m] of its obstacles.
+        radius: footprint radius [m].
+        poses: [N,4], changed in place.
+        delta: [K,4] displacements; env_ids: [K] whose.
+    """
+    done, touched = np.empty((len(env_ids), 4)), np.zeros(len(env_ids), bool)
+    _move(poses, np.asarray(env_ids, np.int64), np.ascontiguousarray(delta, float),
+          np.zeros(len(poses), np.int64), np.array([0, len(rects)]), rects, radius, done, touched)
+    return done, touched
+
+
+def reach_among(rects: np.ndarray, radius: float, x: float, y: float, headings: np.ndarray,
+                length: float) -> np.ndarray:
+    """Where a translation of `length` [m] along each heading [rad] would end, [K,2] m."""
+    return _reach(x, y, headings, length, rects, radius)
+
+
 def motion_noise(delta: np.ndarray, nominal: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Displacements with Gaussian noise along the movement; none on tilt.
 
@@ -99,6 +121,19 @@ def _collides(x, y, rects, radius):
 
 
 @numba.njit(cache=True)
+def _nearby(x, y, reach, rects):
+    """The rectangles that something within `reach` of a point can touch, in their order."""
+    count = 0
+    kept = np.empty(rects.shape[0], np.int64)
+    for m in range(rects.shape[0]):
+        if (rects[m, 0] - x < reach and x - rects[m, 2] < reach
+                and rects[m, 1] - y < reach and y - rects[m, 3] < reach):
+            kept[count] = m
+            count += 1
+    return rects[kept[:count]]
+
+
+@numba.njit(cache=True)
 def _travel(x, y, ux, uy, length, rects, radius):
     """Distance that can be driven along the unit vector (ux, uy), up to `length`."""
     free = 0.0
@@ -131,7 +166,8 @@ def _move(poses, env_ids, delta, house_index, first, rects, radius, done, touche
             heading = yaw + 0.5 * dyaw
             c, s = math.cos(heading), math.sin(heading)
             ux, uy = (c * dx - s * dy) / length, (s * dx + c * dy) / length
-            travelled = _travel(x, y, ux, uy, length, own, radius)
+            near = _nearby(x, y, length + radius + STEP, own)
+            travelled = _travel(x, y, ux, uy, length, near, radius)
             touched[k] = travelled < length
             x += ux * travelled
             y += uy * travelled
@@ -150,6 +186,7 @@ def _move(poses, env_ids, delta, house_index, first, rects, radius, done, touche
 @numba.njit(cache=True)
 def _reach(x, y, headings, length, rects, radius):
     out = np.empty((len(headings), 2))
+    rects = _nearby(x, y, length + radius + STEP, rects)
     for k in range(len(headings)):
         ux, uy = math.cos(headings[k]), math.sin(headings[k])
         travelled = _travel(x, y, ux, uy, length, rects, radius)

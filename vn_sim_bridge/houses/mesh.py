@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
 from pathlib import Path
@@ -14,9 +13,10 @@ from vn_sim_bridge.houses.gltf import read_gltf
 from vn_sim_bridge.houses.labels import LABEL, LABELS
 from vn_sim_bridge.houses.obj import read_obj
 from vn_sim_bridge.houses.surface import MAX_TRIANGLES, Part
-from vn_sim_bridge.render.scene import Scene, TextureSet, uniform_light
+from vn_sim_bridge.render.mesh_scene import Surface, mesh_scene
+from vn_sim_bridge.render.scene import Scene
 
-GROUP = 64  # triangles culled together
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # turns y up into z up
 READERS = {'.obj': read_obj, '.glb': read_gltf, '.gltf': read_gltf}
 
 
@@ -124,84 +124,8 @@ def _label(path, names, labels, default_label) -> int:
 
 def _scene(parts: list[Part], class_ids: list[int], path: Path, up: str, scale: float,
            double_sided: bool | None) -> Scene:
-    images = [np.full((4, 4, 3), 255, np.uint8)]
-    known: dict[tuple, int] = {}  # many parts share a picture
-    numbers: dict[int, int] = {}  # the same by identity: hashing a large one takes a while
-    pieces: list[tuple] = []  # corners, uv, colour, texture, label, instance
-    for instance, (part, label) in enumerate(zip(parts, class_ids, strict=True)):
-        texture = 0
-        if part.picture is not None:
-            if id(part.picture) not in numbers:
-                key = (part.picture.shape,
-                       hashlib.sha256(np.ascontiguousarray(part.picture).data).digest())
-                if key not in known:
-                    known[key] = len(images)
-                    images.append(part.picture)
-                numbers[id(part.picture)] = known[key]
-            texture = numbers[id(part.picture)]
-        uv = np.zeros((len(part.corners), 3, 2)) if part.uv is None else part.uv
-        ids = texture, label, instance % 65534 + 1
-        pieces.append((part.corners, uv, part.colour, *ids))
-        if _both(part, double_sided):
-            pieces.append((part.corners[:, ::-1], uv[:, ::-1], part.colour, *ids))
-    counts = [len(piece[0]) for piece in pieces]
-    corners, uv, colour = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
-    textures, labels, instances = (np.repeat([piece[k] for piece in pieces], counts)
-                                   for k in range(3, 6))
-    corners = corners * scale
-    if up == 'y':
-        corners = corners[..., [0, 2, 1]] * (1, -1, 1)
-    edge_1, edge_2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(edge_1, edge_2)
-    area = np.linalg.norm(normal, axis=1)
-    solid = area > 1e-12  # the others cover nothing
-    if not solid.any():
-        raise UserError('a mesh file has triangles with an area', str(path),
-                        'check its scale, and the scales of its nodes')
-    order = np.nonzero(solid)[0]
-    order = order[np.argsort(_morton(corners[order].mean(axis=1)), kind='stable')]
-    corners, uv, normal, area, edge_1, edge_2 = (
-        values[order] for values in (corners, uv, normal, area, edge_1, edge_2))
-    count = len(order)
-    uv += 1.0 - np.floor(uv.min(axis=1, keepdims=True))  # see SceneBuilder
-    face_uv = np.empty((count, 2, 4))
-    square = (area**2)[:, None]
-    for k in range(2):
-        gradient = ((uv[:, 1, k] - uv[:, 0, k])[:, None] * np.cross(edge_2, normal)
-                    + (uv[:, 2, k] - uv[:, 0, k])[:, None] * np.cross(normal, edge_1)) / square
-        face_uv[:, k, :3] = gradient
-        face_uv[:, k, 3] = uv[:, 0, k] - (gradient * corners[:, 0]).sum(axis=1)
-    unit = normal / area[:, None]
-    group_start = np.append(np.arange(0, count, GROUP), count)
-    boxes = np.concatenate([
-        np.minimum.reduceat(corners.min(axis=1), group_start[:-1]) - 1e-4,
-        np.maximum.reduceat(corners.max(axis=1), group_start[:-1]) + 1e-4], axis=1)
-    face_light, light_map, light = uniform_light(count)
-    return Scene(
-        vertices=corners.reshape(-1, 3).astype(np.float32),
-        face_start=np.arange(0, 3 * count + 1, 3, dtype=np.int32),
-        face_vertices=np.arange(3 * count, dtype=np.int32),
-        face_plane=np.column_stack([unit, (unit * corners[:, 0]).sum(axis=1)]).astype(np.float32),
-        face_uv=face_uv.astype(np.float32),
-        face_texture=textures[order].astype(np.int32),
-        face_colour=colour[order].astype(np.float32),
-        face_label=labels[order].astype(np.uint8),
-        face_instance=instances[order].astype(np.uint16),
-        face_light=face_light, face_light_map=light_map, light=light,
-        group_start=group_start.astype(np.int32),
-        group_box=boxes.astype(np.float32),
-        group_room=np.zeros(len(boxes), np.int32),
-        textures=TextureSet(images),
-    )
-
-
-def _morton(points: np.ndarray) -> np.ndarray:
-    """Place along a curve that keeps neighbours together, [N] uint64."""
-    low = points.min(axis=0)
-    size = max(float((points.max(axis=0) - low).max()), 1e-9)
-    cells = np.clip((points - low) / size * 1023, 0, 1023).astype(np.uint64)
-    code = np.zeros(len(points), np.uint64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return code
+    turn = Z_UP if up == 'y' else np.eye(3)
+    return mesh_scene([
+        Surface(part.corners * scale @ turn.T, part.uv, part.colour, part.picture, label,
+                instance % 65534 + 1, _both(part, double_sided))
+        for instance, (part, label) in enumerate(zip(parts, class_ids, strict=True))], str(path))

@@ -1,0 +1,1 @@
+"""Triangle meshes as places: today's scenes, drawn by this package's renderer."""

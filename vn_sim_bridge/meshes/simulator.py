@@ -1,0 +1,215 @@
+"""Robots in places made of triangles: continuous motion with contacts, pictures by our renderer.
+
+`gltf`, `procthor` and `suncg` are subclasses that say how a place is read.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from vn_nav.scenes import SceneName
+from vn_sim_bridge.counter_random import Stream
+from vn_sim_bridge.floor.contacts import move_among, reach_among
+from vn_sim_bridge.houses.objects import object_scene
+from vn_sim_bridge.meshes.lazy import BUDGET, LazyPlace, PlaceCache
+from vn_sim_bridge.meshes.place import MeshPlace
+from vn_sim_bridge.render.pack import Lights
+from vn_sim_bridge.render.randomisation import Appearance, Randomisation, draw_appearance
+from vn_sim_bridge.render.rasterizer import Rasterizer
+from vn_sim_bridge.render.scene import Scene
+from vn_sim_bridge.render.sensor import expose
+from vn_sim_bridge.simulator import (
+    BaseSimulator,
+    Capabilities,
+    Frames,
+    Motion,
+    Objects,
+    Placed,
+    Setup,
+    no_objects,
+)
+
+Maker = Callable[[], tuple[MeshPlace, Scene]]
+
+
+class MeshSimulator(BaseSimulator):
+    """N robots in meshes. A subclass writes `open`: it names its places and how each is read.
+
+    Every place is a `floor.places.HousePlace`. A robot's place stays in memory; others as far as
+    the budget goes.
+
+    Args:
+        names: of the scenes.
+        makers: of each scene: a function that makes place and scene (`place.make_place`).
+        setup: robots, camera, pictures.
+        label_names: behind the class ids; those of `houses.labels` come first, for the tasks.
+        rooms: whether places know their rooms.
+        budget: bytes of places that are kept though no robot is in them.
+    """
+
+    capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True,
+                                rooms=True, walls=True, placeable_objects=True, appearance=True,
+                                other_goals=True)
+    places: list[LazyPlace]
+
+    @classmethod
+    @abc.abstractmethod
+    def open(cls, scenes: Sequence[SceneName], setup: Setup) -> MeshSimulator:
+        """See `BaseSimulator.open`."""
+
+    def __init__(self, names: Sequence[str], makers: Sequence[Maker], setup: Setup,
+                 label_names: Sequence[str], *, rooms: bool = True, budget: int = BUDGET):
+        self.cache = PlaceCache(makers, functools.partial(_renderer, setup), budget)
+        super().__init__([LazyPlace(name, self.cache, index)
+                          for index, name in enumerate(names)], setup)
+        self.label_names = tuple(label_names)
+        if not rooms:
+            self.capabilities = dataclasses.replace(self.capabilities, rooms=False)
+        self.randomisation = setup.randomisation or Randomisation()
+        self.objects = no_objects(setup.num_envs, setup.objects)
+        self._appearance = self.appearance(0, Stream.APPEARANCE, self._all, 0 * self._all)
+        self._frames: Frames | None = None
+        self._use()
+        for index in sorted(set(self.place_index.tolist())):  # what is wrong is said now
+            self.cache.get(index)
+
+    def _use(self) -> None:
+        self.cache.in_use = frozenset(self.place_index.tolist())
+
+    def enter(self, env_ids: np.ndarray, places: np.ndarray) -> None:
+        """See `Simulator`."""
+        super().enter(env_ids, places)
+        self._use()
+
+    def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
+        """Displace robots by [K,4] in their own frames, up to the first contact."""
+        env_ids = self._all if env_ids is None else np.asarray(env_ids)
+        done, touched = np.zeros((len(env_ids), 4)), np.zeros(len(env_ids), bool)
+        for index, rows in _by_place(self.place_index[env_ids]):
+            rects = self.cache.get(index).place.obstacle_rects
+            done[rows], touched[rows] = move_among(rects, self.robot.footprint_radius, self.poses,
+                                                   delta[rows], env_ids[rows])
+        return Motion(done, touched)
+
+    def reach(self, env_id: int, headings: np.ndarray, length: float) -> np.ndarray:
+        """Where a translation of `length` [m] along each heading [rad] would end, [K,2] m."""
+        rects = self.cache.get(int(self.place_index[env_id])).place.obstacle_rects
+        x, y = self.poses[env_id, :2]
+        return reach_among(rects, self.robot.footprint_radius, x, y, np.asarray(headings, float),
+                           length)
+
+    def appearance(self, seed: int | np.ndarray, stream: Stream, env, episode) -> Appearance:
+        """Light and camera of some episodes, or of some goal pictures."""
+        return draw_appearance(self.randomisation, 1, seed, stream, env, episode)
+
+    def apply_appearance(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream,
+                         env, episode) -> None:
+        """Draw light and camera of robots [K] anew, by the counters [K] of their episodes."""
+        for part, rows in zip(self._appearance, self.appearance(seed, stream, env, episode),
+                              strict=True):
+            part[env_ids] = rows
+
+    def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
+        """Put these objects, and no others, about one robot."""
+        _stand(self.objects, env_id, placed)
+
+    def object_models(self) -> np.ndarray:
+        """[N,M] int64: which model each object is; -1: absent."""
+        return np.where(self.objects.scene >= 0, self.objects.scene - 1, -1)
+
+    def observe(self, env_ids: np.ndarray | None = None,
+                keys: np.ndarray | None = None) -> Frames:
+        """See `Simulator`."""
+        if env_ids is None:
+            self._frames = self._draw(self.place_index, self.poses, self._frames,
+                                      self._appearance, keys, self.objects)
+            return self._frames
+        return self._draw(self.place_index[env_ids], self.poses[env_ids], None,
+                          Appearance(*(part[env_ids] for part in self._appearance)), keys,
+                          Objects(*(part[env_ids] for part in self.objects)))
+
+    def view(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
+             appearance: Appearance | None = None, keys: np.ndarray | None = None,
+             placed: Sequence[Sequence[Placed]] | None = None) -> Frames:
+        """See `Simulator`; by default in standard light."""
+        if appearance is None:
+            appearance = draw_appearance(Randomisation(), 1, 0, Stream.APPEARANCE,
+                                         np.arange(len(poses)), 0)
+        objects = no_objects(len(poses), max(map(len, placed or [()])))
+        for k, items in enumerate(placed or ()):
+            _stand(objects, k, items)
+        return self._draw(np.asarray(place_index), np.asarray(poses, float), out, appearance, keys,
+                          objects)
+
+    def cameras(self, poses: np.ndarray | None = None, appearance: Appearance | None = None
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Simulator`."""
+        robot = self.robot
+        poses = self.poses if poses is None else poses
+        appearance = appearance or self._appearance
+        cameras = np.column_stack([poses[:, :2], robot.camera_height + appearance.height,
+                                   poses[:, 2],
+                                   poses[:, 3] + robot.camera_pitch + appearance.pitch])
+        return cameras, robot.camera_fov + appearance.fov
+
+    def _draw(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None,
+              appearance: Appearance, keys: np.ndarray | None, objects: Objects) -> Frames:
+        cameras, fov = self.cameras(poses, appearance)
+        frames = out or _buffers(len(poses), self.setup.size)
+        lights = Lights(appearance.cube, appearance.lamps)
+        for index, rows in _by_place(place_index):
+            renderer = self.cache.get(index).renderer
+            if renderer.rooms > lights.lamps.shape[1]:  # all rooms have the same lamp
+                lights = Lights(lights.cube, np.repeat(lights.lamps[:, :1], renderer.rooms, 1))
+            if len(rows) == len(poses):  # all in one place: no copies
+                renderer.render(np.zeros(len(rows), np.int64), cameras, fov, frames,
+                                lights=lights, objects=objects)
+                continue
+            drawn = renderer.render(
+                np.zeros(len(rows), np.int64), cameras[rows], fov[rows],
+                lights=Lights(*(part[rows] for part in lights)),
+                objects=Objects(*(part[rows] for part in objects)))
+            for whole, part in zip(frames, drawn, strict=True):
+                whole[rows] = part
+        if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:
+            if keys is None:
+                keys = np.arange(len(poses)).astype(np.uint64)
+            expose(frames.rgb, appearance.noise, appearance.blur, keys)
+        return frames
+
+    def close(self) -> None:
+        """Let go of the places and pictures."""
+        self._frames = None
+        self.cache.clear()
+
+
+def _renderer(setup: Setup, scene: Scene) -> Rasterizer:
+    """What draws a place and the objects that may stand in it."""
+    return Rasterizer([scene, *map(object_scene, setup.models)], setup.size,
+                      threads=setup.threads)
+
+
+def _by_place(place_index: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """The places of some robots [K], and the rows of each."""
+    return [(int(index), np.nonzero(place_index == index)[0])
+            for index in np.unique(place_index)]
+
+
+def _stand(objects: Objects, row: int, placed: Sequence[Placed]) -> None:
+    objects.scene[row] = -1
+    for m, item in enumerate(placed):
+        objects.scene[row, m] = 1 + item.model  # 0 is the place itself
+        objects.pose[row, m] = item.x, item.y, 0.0, item.yaw
+        objects.room[row, m] = 0
+
+
+def _buffers(count: int, size: int) -> Frames:
+    return Frames(np.empty((count, 3, size, size), np.uint8),
+                  np.empty((count, size, size), np.float32),
+                  np.empty((count, size, size), np.uint8),
+                  np.empty((count, size, size), np.uint16))
