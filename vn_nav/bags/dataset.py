@@ -51,7 +51,7 @@ class DriveSet:
     goal: np.ndarray  # [N] int64 into goals, -1: no goal was shown
     goals: np.ndarray  # [G,3,S,S] uint8
     depth: Pictures | None  # [N,S,S] uint8, 255 at `MAX_DEPTH`, 0 where unknown
-    labels: np.ndarray | None  # [N,S,S] uint8 class ids
+    labels: np.ndarray | None  # [N,S,S] class ids, uint8, or uint16 where the bag has them so
     facts: dict  # what the bag held and what did not fit
 
     def __len__(self) -> int:

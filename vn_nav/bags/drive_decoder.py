@@ -25,7 +25,7 @@ from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
 
-FORMAT = 2  # of the files; another one is decoded anew
+FORMAT = 3  # of the files; another one is decoded anew
 INDEX = 'index.json'
 # Pictures in the decoders at once: bounds the memory.
 MAX_PICTURES_IN_FLIGHT = 64
@@ -106,6 +106,28 @@ def _field_of_view(bag: str | Path, topic: str) -> float | None:
     return None
 
 
+def _label_type(bag: str | Path, topic: str) -> np.dtype:
+    """Of the labels of a bag, as its first picture of them has it."""
+    for message in messages(bag, (topic,)):
+        with contextlib.suppress(ImageError):
+            return decode_labels(message.message).dtype
+        break
+    return np.dtype(np.uint8)
+
+
+def _label_names(bag: str | Path, topic: str) -> list[str]:
+    """Behind the class ids, as the topic `names` next to theirs has them; empty: it has none."""
+    names_topic = topic.rpartition('/')[0] + '/names'
+    if names_topic not in summary(bag):
+        return []
+    for message in messages(bag, (names_topic,)):
+        with contextlib.suppress(ValueError):
+            names = json.loads(message.message.data)
+            if isinstance(names, list) and all(isinstance(name, str) for name in names):
+                return names
+    return []
+
+
 class _Columns:
     """Arrays that grow on disk, row by row."""
 
@@ -138,6 +160,8 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
     report, columns = Report(), _Columns(folder)
     steps, facts = read_steps(bag, wanted, report)
     optional = {name: _Optional(name) for name in ('depth', 'labels') if facts['topics'][name]}
+    if 'labels' in optional:
+        optional['labels'].dtype = _label_type(bag, facts['topics']['labels'])
     goals: dict[bytes, int] = {}
     shown_goal, number, bad, unseen = None, -1, 0, 0
     rows: list[list[float]] = []
@@ -159,7 +183,7 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
         for name, counted in optional.items():
             counted.look(frame, pictures)
             missing = np.zeros((wanted.size, wanted.size), np.uint8)
-            columns.append(name, pictures.get(name, missing).astype(np.uint8))
+            columns.append(name, pictures.get(name, missing).astype(counted.dtype))
         columns.append('beside', np.array(['depth' in pictures, 'labels' in pictures]))
     if not rows:
         raise UserError('a bag for learning holds pictures with matching poses',
@@ -172,6 +196,9 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
         'jumps': report.jumps, 'set_back': report.set_back, 'episodes': report.episodes,
         'misfits': report.misfits, 'misfit_share': report.misfit_share,
         'actions': {wanted.robot.action_names[k]: n for k, n in sorted(report.actions.items())}}
+    if 'labels' in optional:
+        facts |= {'label_names': _label_names(bag, facts['topics']['labels']),
+                  'classes': optional['labels'].most + 1}
     facts['notes'] = [note for counted in optional.values() if (note := counted.summary())]
     if unseen:
         facts['notes'].append(f'{unseen} goal picture{"s" * (unseen > 1)} cannot be decoded')
@@ -186,9 +213,13 @@ class _Optional:
         self._role, self._decode = role, decode_depth if role == 'depth' else decode_labels
         self._all = self._missing = self._unreadable = 0
         self._why = ''
+        self.dtype = np.dtype(np.uint8)  # that they are stored in
+        self.most = -1  # the highest number in the pictures
 
     def look(self, frame: Frame, pictures: dict[str, np.ndarray]) -> None:
         self._all += 1
+        if self._role in pictures:
+            self._count(pictures)
         message = getattr(frame, self._role)
         self._missing += message is None
         if message is None or self._role in pictures:
@@ -199,6 +230,16 @@ class _Optional:
                 self._decode(message)
             except ImageError as error:
                 self._why = str(error)
+
+    def _count(self, pictures: dict[str, np.ndarray]) -> None:
+        """Look for the highest number; leave out what the type cannot hold."""
+        most = int(pictures[self._role].max(initial=0))
+        if most > np.iinfo(self.dtype).max:
+            del pictures[self._role]
+            self._why = self._why or (f'the first labels have {8 * self.dtype.itemsize} bits, '
+                                      f'here is the class {most}')
+        else:
+            self.most = max(self.most, most)
 
     def summary(self) -> str:
         """That they are left out, and why; empty: they are all there."""

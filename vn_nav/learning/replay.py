@@ -32,8 +32,8 @@ class Replay(ReplayRings):
 
         Returns:
             [length+1,batch] observations. `starts` only where an episode really begins; `state`
-            is None: the consumer begins with zeros. `privileged` pictures are uint8 (depth: 255
-            is `max_depth`) and hold `goal_segmentation` where the memory has its table.
+            is None: the consumer begins with zeros. `privileged` pictures are as they are stored
+            (depth: 255 is `max_depth`) and hold `goal_segmentation` where there is its table.
 
         Raises:
             UserError: nothing is stored yet.

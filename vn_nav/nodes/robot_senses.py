@@ -70,6 +70,7 @@ class Senses:
         goal: the goal picture in force [3,S,S]; None: none yet.
         goals: number of goals that were taken.
         scene: what a simulator publishes of itself; empty: none does.
+        label_names: behind the class ids of labels; empty: none are published.
         camera_fov: of the pictures [rad]; None: unknown.
         frame: stamp [s] and picture, the newest of the present goal.
         tally: what came since the last decision.
@@ -85,6 +86,7 @@ class Senses:
         self.goal: np.ndarray | None = None
         self.goals = 0
         self.scene: dict = {}
+        self.label_names: tuple[str, ...] = ()
         self.camera_fov: float | None = None
         self.frame: tuple[float, np.ndarray] | None = None
         self.tally = Tally()
@@ -95,6 +97,7 @@ class Senses:
         topics.subscribe(Bool, 'arrived', self._on_arrived, history=False)
         topics.subscribe(UInt8, 'episode_end', self._on_episode_end, history=False)
         topics.subscribe(String, 'scene', self._on_scene)
+        topics.subscribe(String, 'labels/names', self._on_label_names)
         topics.subscribe(Image, 'goal_image', self._on_goal, anybody=True)
         # In lock-step no odometry may be missed, and the simulator is reliable.
         topics.subscribe(Odometry, 'odom', output.take_odometry, anybody=not lock_step)
@@ -185,6 +188,16 @@ class Senses:
             return
         if isinstance(scene, dict):
             self.scene = scene
+
+    def _on_label_names(self, message: String) -> None:
+        try:
+            names = json.loads(message.data)
+        except ValueError:
+            return
+        if isinstance(names, list) and all(isinstance(name, str) for name in names):
+            with self._wake:
+                self.label_names = tuple(names)
+                self._wake.notify_all()
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         side, focal = min(message.width, message.height), message.k[0]

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.render.scene import MAX_TEXTURE, Scene, TextureSet, uniform_light
+from vn_sim_bridge.render.scene import MAX_TEXTURE, Scene, TextureSet, as_labels, uniform_light
 
 GROUP = 64  # triangles culled together
 SMALLEST = 1e-12  # m^2, twice the area: what is smaller covers nothing
-MOST_LABELS, MOST_INSTANCES = 256, 65536  # that a pixel can name
+MOST_LABELS, MOST_INSTANCES = 65536, 65536  # that a pixel can name
 
 
 class Surface(NamedTuple):
@@ -86,7 +86,7 @@ def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | Non
         face_uv=_planes_of_uv(corners, uv, normal, area, edge_1, edge_2),
         face_texture=textures[order].astype(np.int32),
         face_colour=colour[order].astype(np.float32),
-        face_label=labels[order].astype(np.uint8),
+        face_label=as_labels(labels[order]),
         face_instance=instances[order].astype(np.uint16),
         face_light=face_light, face_light_map=light_map, light=light,
         group_start=group_start.astype(np.int32),
