@@ -117,6 +117,11 @@ def decode_depth(message: Any) -> np.ndarray:
     return depth
 
 
+def label_encoding(labels: np.ndarray) -> str:
+    """The encoding of class ids [H,W] uint8 or uint16."""
+    return 'mono8' if labels.dtype == np.uint8 else '16UC1'
+
+
 def decode_labels(message: Any) -> np.ndarray:
     """Class ids as [H,W] uint8 or uint16."""
     return np.ascontiguousarray(_raw_array(message, LABELS))

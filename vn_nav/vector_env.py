@@ -93,7 +93,16 @@ class PlacedEnv(Protocol):
 class GoalLabelsEnv(Protocol):
     """Knows what its goal pictures show."""
 
-    goal_segmentation: Any  # [G,S,S] uint8, array or tensor
+    goal_segmentation: Any  # [G,S,S] uint8 or uint16, array or tensor
+
+
+@runtime_checkable
+class LabelledEnv(Protocol):
+    """Knows the names of the classes that segmentations show."""
+
+    @property
+    def label_names(self) -> Sequence[str]:
+        """Behind the ids; none: there are no labels, or nobody says."""
 
 
 @runtime_checkable

@@ -71,7 +71,8 @@ class Sensors:
         if self._listened(name := 'depth/camera_info'):
             self._publish(name, self._info, stamp, frame)
         for name, picture, encoding in (('depth/image_raw', seen.depth[0], '32FC1'),
-                                        ('labels/image_raw', seen.labels[0], 'mono8')):
+                                        ('labels/image_raw', seen.labels[0],
+                                         images.label_encoding(seen.labels))):
             if self._listened(name):
                 message = images.fill_image(self._make(name), picture, encoding)
                 self._publish(name, message, stamp, frame)

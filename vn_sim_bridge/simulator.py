@@ -124,7 +124,9 @@ class Frames(NamedTuple):
 
     rgb: np.ndarray  # [K,3,S,S] uint8
     depth: np.ndarray  # [K,S,S] float32 m along the optical axis; 0: unknown
-    labels: np.ndarray  # [K,S,S] uint8 class ids, names in `Simulator.label_names`
+    # [K,S,S] class ids, names in `Simulator.label_names`; uint8, or uint16 of more than
+    # 256 classes: `vn_nav.labels.label_dtype`.
+    labels: np.ndarray
     instances: np.ndarray  # [K,S,S] uint16
 
 
@@ -179,7 +181,7 @@ class Simulator(Protocol):
 
     @property
     def label_names(self) -> Sequence[str]:
-        """Behind the class ids."""
+        """Behind the class ids; none where there are no labels."""
 
     @property
     def places(self) -> Sequence[Place]:
@@ -270,6 +272,9 @@ class BaseSimulator(abc.ABC):
     version: str = '1'
     capabilities: Capabilities
     label_names: Sequence[str] = ()
+    # Names of movable objects, by task: `object` goes to one of them, in `collect` the first is
+    # worth 1 and the second -1. Of simulators with `placeable_objects`; `Setup.models` has them.
+    task_objects: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     splits: ClassVar[Mapping[str, Sequence[str]]] = {}  # names of scenes by the split's name
     planner: Planner | None = None
     places: Sequence[Place]

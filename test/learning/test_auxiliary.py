@@ -138,7 +138,7 @@ def test_image_losses_are_mean_squared_errors_of_averaged_pictures(name):
     loss = auxiliary.image_loss(network, name, maps_of(latents, rollout), rollout)
     drawn = network.heads[name](latents.maps).detach().view(10, 6, -1, 8, 8)
     target = target_of(network, name, rollout).view(10, 6, -1, 8, 8)
-    colours = label_colours(auxiliary.CLASS_COUNT)
+    colours = label_colours(network.config.classes)
     errors = []
     for t, env in torch.nonzero(rollout.valid).tolist():
         if name == 'depth':

@@ -1,7 +1,9 @@
 """The replay memory and the pictures' targets: stored values tell their environment and row."""
 
 import colorsys
+import hashlib
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +108,23 @@ def decode(image):
     """Row and environment [...] that a picture [...,3,S,S] tells."""
     code = image[..., 0, 0].long()
     return code[..., 0] + 256 * code[..., 1], code[..., 2]
+
+
+def test_ids_above_255_come_back_as_they_went_in(tmp_path):
+    stream = Stream(LENGTHS, 60)
+    stream.segmentation = (stream.segmentation.int() + 40_000).to(torch.uint16)
+    for folder in (None, tmp_path / 'replay'):
+        replay = stream.fill(memory(label_type=torch.uint16, directory=folder), 40)
+        window = replay.windows(200, 8, draws())
+        assert window.privileged['segmentation'].dtype == torch.uint16
+        assert torch.equal(window.privileged['segmentation'],
+                           stream.segmentation[decode(window.observation.image)])
+        assert replay.nbytes == Replay.bytes_needed(60, ENVS, SIZE, label_type=torch.uint16)
+    assert memory().nbytes < replay.nbytes  # one byte a pixel where it is enough
+    with pytest.raises(UserError, match=r'segmentations of this memory are torch\.uint8'):
+        stream.fill(memory(), 40)
+    with pytest.raises(UserError, match='replay files fit the memory'):
+        memory(directory=tmp_path / 'replay')
 
 
 @pytest.mark.parametrize('rows', [25, 60, 61, 217, 300])
@@ -503,5 +522,30 @@ def test_colours_lie_farther_apart_than_by_chance_or_on_a_wheel_of_hues(count):
         others = [torch.rand(count - 1, 3, generator=draws(seed)) for seed in range(50)]
         for other in (torch.tensor(hues), *others):
             assert gap(colours) > gap(torch.cat([black, other])) - 1e-6
-    with pytest.raises(UserError, match='1 to 256 classes'):
-        label_colours(257)
+    with pytest.raises(UserError, match='1 to 65536 classes'):
+        label_colours(65_537)
+
+
+def test_the_colours_of_published_weights_are_as_they_were():
+    """Of up to 64 classes, whatever more classes take."""
+    digests = {5: 'c3dca6a10fc89f47', 57: 'adf4c80da5958f0c', 64: 'f528bdb54742cb04'}
+    assert {count: hashlib.sha256(label_colours(count).numpy().tobytes()).hexdigest()[:16]
+            for count in digests} == digests
+
+
+@pytest.mark.parametrize('count', [65, 100, 190, 256, 257, 700, 1500])
+def test_many_colours_are_as_far_apart_as_balls_can_be_packed(count):
+    """The volume of the cone over their number says how far apart they can be inside it."""
+    colours = label_colours(count)
+    points = []
+    for colour in colours.tolist():
+        hue, saturation, brightness = colorsys.rgb_to_hsv(*colour)
+        turn, chroma = 2 * math.pi * hue, saturation * brightness
+        points.append([chroma * math.cos(turn), chroma * math.sin(turn), brightness])
+    gap = float(torch.pdist(torch.tensor(points, dtype=torch.float64)).min())
+    densest = (math.sqrt(2) * (math.pi / 3) / count) ** (1 / 3)
+    assert gap > 0.95 * densest and not colours[0].any()
+    assert 0 <= float(colours.min()) and float(colours.max()) <= 1
+    assert torch.equal(colours, label_colours(count))
+    # They are 8-bit pictures of this many colours, too.
+    assert len({tuple(row) for row in (colours * 255).round().int().tolist()}) == count

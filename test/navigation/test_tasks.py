@@ -6,7 +6,7 @@ import pytest
 from vn_nav.errors import UserError
 from vn_nav.scenes import house_scenes
 from vn_sim_bridge.floor.distance import FloorDistance
-from vn_sim_bridge.houses.labels import LABEL
+from vn_sim_bridge.houses.labels import LABEL, LABELS
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS, object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.navigation import tasks
@@ -46,8 +46,16 @@ def test_a_room_is_seen_when_its_objects_fill_a_share_of_the_picture():
     labels = np.zeros((2, 20, 20), np.uint8)
     labels[0, 0, :18] = LABEL['toilet']  # 4.5 %
     labels[1, 0, :17] = LABEL['toilet']
-    assert tasks.shows_room(labels, 'bathroom').tolist() == [True, False]
-    assert not tasks.shows_room(labels, 'kitchen').any()
+    bathroom, kitchen = (tasks.room_classes(LABELS, kind) for kind in ('bathroom', 'kitchen'))
+    assert tasks.shows_room(labels, bathroom).tolist() == [True, False]
+    assert not tasks.shows_room(labels, kitchen).any()
+    # Another simulator has other numbers, above 255 too.
+    names = [*map(str, range(300)), 'toilet']
+    wide = np.where(labels == LABEL['toilet'], np.uint16(300), np.uint16(44))
+    assert tasks.shows_room(wide, tasks.room_classes(names, 'bathroom')).tolist() == [True, False]
+    for kind in ('kitchen', 'cellar'):
+        with pytest.raises(UserError, match='room_must_see'):
+            tasks.room_classes(names, kind)
 
 
 @pytest.mark.parametrize('objects', [1, 4])
@@ -112,7 +120,8 @@ def test_any_room_of_the_type_will_do():
 
 def test_seeing_the_room_takes_two_decisions_in_a_row():
     house = generate_house(7)
-    task = tasks.RoomGoal([house], 1, must_see=True, min_distance=1.0)
+    task = tasks.RoomGoal([house], 1, must_see=True, min_distance=1.0,
+                          label_names=LABELS)
     task.begin(0, 0, (0, 0, 0), 1.0, 'right')
     goal = task.state['goal'][0]
     inside = np.array([[*task.views[goal].pose]])

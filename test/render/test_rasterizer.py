@@ -12,7 +12,7 @@ from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
 from vn_sim_bridge.render.rasterizer import Rasterizer
-from vn_sim_bridge.render.scene import SceneBuilder
+from vn_sim_bridge.render.scene import SceneBuilder, as_labels
 from vn_sim_bridge.simulator import Objects
 
 FOV = math.radians(90)
@@ -187,3 +187,29 @@ def test_distant_textures_are_averaged_not_sampled():
     start = texture.start[TEXTURES['weave']]
     assert (texture.texels[start:start + 64 * 64] & 255).std() > 12  # seen from near by
     assert rgb.std() < 4  # threads far below a pixel are one grey
+
+
+def test_classes_above_255_are_drawn_as_they_are(house):
+    seen = Rasterizer([house.scene, object_scene('ball')], 40)
+    shift = 40_000
+    moved = [dataclasses.replace(scene, face_label=as_labels(scene.face_label.astype(int) + shift),
+                                 face_instance=scene.face_instance + np.uint16(50_000))
+             for scene in (house.scene, object_scene('ball'))]
+    wide = Rasterizer(moved, 40, label_type=np.uint16)
+    view = cameras(house, 6, tilt=0.3)
+    ahead = view[:, None, :2] + np.stack([np.cos(view[:, 3]), np.sin(view[:, 3])], 1)[:, None]
+    things = Objects(np.ones((6, 1), int), np.concatenate([ahead, np.zeros((6, 1, 2))], 2),
+                     np.zeros((6, 1), int))
+    one = seen.render(np.zeros(6, int), view, FOV, objects=things)
+    two = wide.render(np.zeros(6, int), view, FOV, objects=things)
+    assert two[2].dtype == np.uint16 and one[2].dtype == np.uint8
+    shown = one[1] > 0
+    assert np.array_equal(one[0], two[0]) and np.array_equal(one[1], two[1]) and shown.any()
+    assert np.array_equal(one[2][shown].astype(int) + shift, two[2][shown])
+    own = shown & (one[3] < 65_000)
+    assert np.array_equal(one[3][own].astype(int) + 50_000, two[3][own]) and (shown & ~own).any()
+    assert np.array_equal(one[3][shown & ~own], two[3][shown & ~own])
+    with pytest.raises(UserError, match='class ids of a uint8 are at most 255'):
+        Rasterizer(moved, 40)
+    with pytest.raises(UserError, match='class ids lie between 0 and 65535'):
+        as_labels([0, 65_536])

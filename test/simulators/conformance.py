@@ -8,6 +8,7 @@ import pytest
 
 from vn_nav.co_visibility import co_visible, lift
 from vn_nav.errors import UserError
+from vn_nav.labels import label_dtype
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream, key
@@ -95,9 +96,10 @@ class Conformance(abc.ABC):
         assert poses.shape == (n, 4) and poses.dtype == np.float64
         assert shared.place_index.shape == shared.seen_from.shape[:1] == (n,)
         assert shared.objects.scene.shape == shared.object_models().shape
+        labels = label_dtype(len(shared.label_names))
         frames = shared.observe()
         for part, shape, dtype in zip(frames, ((n, 3, SIZE, SIZE), *[(n, SIZE, SIZE)] * 3),
-                                      (np.uint8, np.float32, np.uint8, np.uint16), strict=True):
+                                      (np.uint8, np.float32, labels, np.uint16), strict=True):
             assert part.shape == shape and part.dtype == dtype
         some = shared.observe(np.array([2, 0]))
         assert some.rgb.shape == (2, 3, SIZE, SIZE)

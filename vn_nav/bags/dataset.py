@@ -36,7 +36,7 @@ from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
 from vn_nav.robot import RobotSpec
 
-FORMAT = 2  # of the files; another one is decoded anew
+FORMAT = 3  # of the files; another one is decoded anew
 INDEX = 'index.json'
 MAX_DEPTH = 10.0  # m, stored as 255; 0: unknown
 # Pictures in the decoders at once: bounds the memory.
@@ -81,7 +81,7 @@ class DriveSet:
     goal: np.ndarray  # [N] int64 into goals, -1: no goal was shown
     goals: np.ndarray  # [G,3,S,S] uint8
     depth: Pictures | None  # [N,S,S] uint8, 255 at `MAX_DEPTH`, 0 where unknown
-    labels: np.ndarray | None  # [N,S,S] uint8 class ids
+    labels: np.ndarray | None  # [N,S,S] class ids, uint8, or uint16 where the bag has them so
     facts: dict  # what the bag held and what did not fit
 
     def __len__(self) -> int:
@@ -204,6 +204,28 @@ def _field_of_view(bag: str | Path, topic: str) -> float | None:
     return None
 
 
+def _label_type(bag: str | Path, topic: str) -> np.dtype:
+    """Of the labels of a bag, as its first picture of them has it."""
+    for message in messages(bag, (topic,)):
+        with contextlib.suppress(ImageError):
+            return decode_labels(message.message).dtype
+        break
+    return np.dtype(np.uint8)
+
+
+def _label_names(bag: str | Path, topic: str) -> list[str]:
+    """Behind the class ids, as the topic `names` beside theirs says; empty: it does not."""
+    beside = topic.rpartition('/')[0] + '/names'
+    if beside not in summary(bag):
+        return []
+    for message in messages(bag, (beside,)):
+        with contextlib.suppress(ValueError):
+            said = json.loads(message.message.data)
+            if isinstance(said, list) and all(isinstance(name, str) for name in said):
+                return said
+    return []
+
+
 class _Columns:
     """Arrays that grow on disk, row by row."""
 
@@ -235,6 +257,8 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
     report, columns = Report(), _Columns(folder)
     steps, facts = read_steps(bag, wanted, report)
     beside = {name: _Beside(name) for name in ('depth', 'labels') if facts['topics'][name]}
+    if 'labels' in beside:
+        beside['labels'].dtype = _label_type(bag, facts['topics']['labels'])
     goals: dict[bytes, int] = {}
     shown_goal, number, bad, unseen = None, -1, 0, 0
     rows: list[list[float]] = []
@@ -256,7 +280,7 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
         for name, counted in beside.items():
             counted.look(frame, pictures)
             missing = np.zeros((wanted.size, wanted.size), np.uint8)
-            columns.append(name, pictures.get(name, missing).astype(np.uint8))
+            columns.append(name, pictures.get(name, missing).astype(counted.dtype))
         columns.append('beside', np.array(['depth' in pictures, 'labels' in pictures]))
     if not rows:
         raise UserError('a bag for learning holds pictures with matching poses',
@@ -269,6 +293,9 @@ def _decode(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], Non
         'jumps': report.jumps, 'set_back': report.set_back, 'episodes': report.episodes,
         'misfits': report.misfits, 'misfit_share': report.misfit_share,
         'actions': {wanted.robot.action_names[k]: n for k, n in sorted(report.actions.items())}}
+    if 'labels' in beside:
+        facts |= {'label_names': _label_names(bag, facts['topics']['labels']),
+                  'classes': beside['labels'].most + 1}
     facts['notes'] = [words for counted in beside.values() if (words := counted.words())]
     if unseen:
         facts['notes'].append(f'{unseen} goal picture{"s" * (unseen > 1)} cannot be decoded')
@@ -283,9 +310,13 @@ class _Beside:
         self._role, self._decode = role, decode_depth if role == 'depth' else decode_labels
         self._all = self._missing = self._unreadable = 0
         self._why = ''
+        self.dtype = np.dtype(np.uint8)  # that they are stored in
+        self.most = -1  # the highest number in the pictures
 
     def look(self, frame: Frame, pictures: dict[str, np.ndarray]) -> None:
         self._all += 1
+        if self._role in pictures:
+            self._count(pictures)
         message = getattr(frame, self._role)
         self._missing += message is None
         if message is None or self._role in pictures:
@@ -296,6 +327,16 @@ class _Beside:
                 self._decode(message)
             except ImageError as error:
                 self._why = str(error)
+
+    def _count(self, pictures: dict[str, np.ndarray]) -> None:
+        """Look for the highest number; leave out what the type cannot hold."""
+        most = int(pictures[self._role].max(initial=0))
+        if most > np.iinfo(self.dtype).max:
+            del pictures[self._role]
+            self._why = self._why or (f'the first labels have {8 * self.dtype.itemsize} bits, '
+                                      f'here is the class {most}')
+        else:
+            self.most = max(self.most, most)
 
     def words(self) -> str:
         """That they are left out, and why; empty: they are all there."""

@@ -171,12 +171,19 @@ def _scenes(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
     for scenes in splits.values():
         check_version(checkpoint.info, simulator=one_simulator(scenes)[0])
 
+    said: set[str] = set()
+
+    def say(line: str) -> None:  # once, however many environments there are
+        if line not in said:
+            said.add(line)
+            print(line, flush=True)
+
     def make(split: str, names, environments: int, stop: str):
         return make_env_for(
             checkpoint, names, environments, stop=stop, robot=args.robot,
             own=set(splits[split]) <= set(checkpoint.info['scenes']),
             randomisation=args.randomisation, max_decisions=args.max_decisions,
-            goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0)
+            goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0, say=say)
     return splits, make
 
 

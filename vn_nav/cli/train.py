@@ -12,6 +12,7 @@ from vn_nav.cli.options import command_words, parse_changes
 from vn_nav.cli.scenes import training_scenes
 from vn_nav.cli.world import add_world, check_backend, machine, make_env
 from vn_nav.errors import UserError
+from vn_nav.learning.left_out import config_without
 from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.learning.pretrain_job import load_bags, print_line
@@ -155,13 +156,19 @@ def run(args: argparse.Namespace) -> int:
     from vn_sim_bridge.navigation.env_config import PRIVILEGED
     scenes = training_scenes(args)
     config, world = train_config(args), world_options(args)
+    # The preset's wishes, where nobody else has any.
+    optional = [name for name in ('progress_reward', 'exploration_reward')
+                if getattr(args, name) is None]
     env = make_env(scenes, world.pop('envs'), robot=args.robot, threads=config.threads,
                    randomisation=args.randomisation, size=args.size, seed=args.seed,
-                   device=config.device,
+                   device=config.device, may_lack=optional,
                    actions=tuple(args.actions.split(',')), task=args.task,
                    objects=args.objects, goals_per_room=args.goals_per_room,
                    goal_variants=args.goal_variants,
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
+    config, words = config_without(config, env.config.privileged, env.simulator_name)
+    for line in words:
+        print(line, flush=True)
     bags = _bag_mix(args, config, env.robot)
     info = _info(args, config, env, bags) | {
         'simulator': env.simulator_name, 'scenes': scenes, 'randomisation': args.randomisation,

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import math
 import os
 import platform
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vn_nav.cli.scenes import add_scene_options
 from vn_nav.errors import UserError
 from vn_nav.scenes import BAG, ROOMS
 
+SAY = functools.partial(print, flush=True)
 BACKENDS = ('house',)  # of --house and --houses; other scenes are named by --scene
 
 
@@ -37,20 +40,46 @@ def check_backend(name: str) -> None:
 
 
 def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
-             randomisation: str | Path = 'none', device: str = 'cpu', **options):
+             randomisation: str | Path = 'none', device: str = 'cpu',
+             may_lack: Collection[str] | None = None,
+             say: Callable[[str], None] = SAY, **options):
     """A `NavigationEnv` of some scenes; without a robot file with the standard robot.
 
     On a device other than the CPU it is a `WarpNavigationEnv`.
+
+    Args:
+        may_lack: options of `env_config.OPTIONAL` that are left out, with a line, in a simulator
+            that cannot do them; then `privileged` are wishes as well. None: all must be there.
+        say: receives the lines.
     """
-    from vn_nav.robot import load_robot
+    from vn_nav.robot import RobotSpec, load_robot
     from vn_sim_bridge.navigation.env import NavigationEnv
-    from vn_sim_bridge.navigation.env_config import EnvConfig
+    from vn_sim_bridge.navigation.env_config import (
+        EnvConfig,
+        check_simulator,
+        setup_for,
+        without_the_unknown,
+    )
     from vn_sim_bridge.render.randomisation import load_randomisation
+    from vn_sim_bridge.simulators import open_simulator
     config = EnvConfig(scenes=tuple(scenes), num_envs=envs,
                        randomisation=load_randomisation(randomisation), **options)
     spec = load_robot(robot) if robot else None
     if device == 'cpu':
-        return NavigationEnv(config, spec, threads=threads)
+        if may_lack is None:
+            return NavigationEnv(config, spec, threads=threads)
+        own = (spec or RobotSpec()).with_actions(config.actions)
+        simulator = open_simulator(config.scenes, setup_for(config, own, threads))
+        try:
+            config, words = without_the_unknown(config, simulator, may_lack)
+            check_simulator(simulator, config, own)
+            env = NavigationEnv(config, spec, simulator=simulator)
+        except BaseException:
+            simulator.close()
+            raise
+        for line in words:
+            say(line)
+        return env
     _check_gpu(device)
     from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
     return WarpNavigationEnv(config, spec, device=device)
@@ -58,7 +87,8 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
 
 def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
-                 max_decisions: int = 300, goal_seed: int = 0):
+                 max_decisions: int = 300, goal_seed: int = 0,
+                 say: Callable[[str], None] = SAY):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
 
     Args:
@@ -66,9 +96,10 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         scenes, envs, robot: see `make_env`.
         stop: what ends an episode before its limit, 'arrival' or 'declared'.
         own: the scenes are those that it was trained in, with as many goals.
-        randomisation: None: that of the training.
+        randomisation: None: that of the training, as far as the simulator can vary its pictures.
         max_decisions: of an episode.
         goal_seed: 0 for the goals of the training.
+        say: receives a line about what the simulator cannot vary.
 
     Raises:
         UserError: the checkpoint belongs to another version of the simulator.
@@ -78,7 +109,8 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                    randomisation=randomisation or info['randomisation'], task=info['task'],
                    objects=info['objects'], actions=checkpoint.config.actions,
                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
-                   goals_per_room=info['goals_per_room'] if own else 1)
+                   goals_per_room=info['goals_per_room'] if own else 1,
+                   may_lack=() if randomisation else ('randomisation',), say=say)
     try:
         check_version(info, simulator=env.simulator_name, version=env.world_version)
     except UserError:

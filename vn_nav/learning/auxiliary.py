@@ -28,7 +28,6 @@ from vn_nav.policy.network import Latents, Policy
 FAR = 12.0  # m, beyond which distances count as this far
 POSE_OVERLAP = 0.1  # share of the goal picture that must be in view for its pose to count
 WARMTH = 0.5  # decisions: an action that loses so much is a third as likely to be imitated
-CLASS_COUNT = 64  # colours; label ids are below
 
 
 def image_target(network: Policy, name: str, shown: Tensor) -> Tensor:
@@ -40,7 +39,8 @@ def image_target(network: Policy, name: str, shown: Tensor) -> Tensor:
         network: with the head.
         name: of the head.
         shown: [N,3,S,S] uint8 pictures (reconstruction), [N,S,S] depth, as float m or as uint8
-            with 255 at `MAX_DEPTH`, or [N,S,S] uint8 class ids.
+            with 255 at `MAX_DEPTH`, or [N,S,S] uint8 or uint16 class ids below the network's
+            `classes`.
     """
     if name == 'reconstruction':
         picture = shown.float() / 255
@@ -48,13 +48,14 @@ def image_target(network: Policy, name: str, shown: Tensor) -> Tensor:
         scaled = shown.float() / 255 if shown.dtype == torch.uint8 else shown / MAX_DEPTH
         picture = scaled.clamp(0, 1).unsqueeze(1)
     else:
-        return label_target(shown, _colours(shown.device), network.target_side, network.cell)
+        colours = _colours(shown.device, network.config.classes)
+        return label_target(shown, colours, network.target_side, network.cell)
     return average_pool_target(picture, network.target_side, network.cell)
 
 
 @functools.cache
-def _colours(device: torch.device) -> Tensor:
-    return label_colours(CLASS_COUNT).to(device)
+def _colours(device: torch.device, count: int) -> Tensor:
+    return label_colours(count).to(device)
 
 
 def image_loss(network: Policy, name: str, maps: Tensor, rollout: Rollout) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -61,6 +61,33 @@ class BagMix:
     def heads(self) -> tuple[str, ...]:
         """The heads that the network needs."""
         return tuple(part for part in self.parts if part != 'cloning')
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Behind the classes of labels that are learned; empty: there are none, or unknown."""
+        return self.drives.label_names if self._segments else ()
+
+    @property
+    def classes(self) -> int:
+        """Of the labels that are learned; 0: there are none."""
+        return self.drives.classes if self._segments else 0
+
+    @property
+    def _segments(self) -> bool:
+        return any(NEEDS.get(part) == 'labels' for part in self.parts)
+
+    def leave_out(self, names: Sequence[str]) -> list[str]:
+        """Teach no more than the other parts; those of the names that would have been taught.
+
+        Raises:
+            UserError: nothing is left.
+        """
+        gone = [part for part in self.parts if part in names]
+        self.parts = tuple(part for part in self.parts if part not in names)
+        if not self.parts:
+            raise UserError('bags beside rollouts teach something', f'only {", ".join(gone)}, '
+                            'whose classes of labels are others here', 'leave out --bags')
+        return gone
 
     @property
     def columns(self) -> tuple[str, ...]:

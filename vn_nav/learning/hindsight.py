@@ -17,6 +17,7 @@ from vn_nav.bags.dataset import MAX_DEPTH
 from vn_nav.bags.drive import NO_ACTION
 from vn_nav.co_visibility import co_visible, co_visible_by_poses, lift, relative_pose
 from vn_nav.errors import UserError
+from vn_nav.labels import label_dtype
 from vn_nav.robot import RobotSpec
 
 if TYPE_CHECKING:
@@ -95,6 +96,28 @@ class Drives:
     def __len__(self) -> int:
         return len(self.action)
 
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Behind the class ids, of the bags that have labels; empty: none of them says.
+
+        Raises:
+            UserError: they name different classes.
+        """
+        named = {tuple(part.facts.get('label_names', ())): part.facts.get('bag')
+                 for part in self.sets if part.labels is not None}
+        known = [names for names in named if names]
+        if len(known) > 1:
+            raise UserError('bags whose labels are learned together name the same classes',
+                            ' and '.join(str(named[names]) for names in known[:2]),
+                            'learn from them one after the other')
+        return known[0] if known else ()
+
+    @property
+    def classes(self) -> int:
+        """Of the labels in the bags."""
+        return max((max(len(part.facts.get('label_names', ())), part.facts.get('classes', 0))
+                    for part in self.sets if part.labels is not None), default=0)
+
     def pictures(self, name: str, rows: np.ndarray) -> np.ndarray:
         """`image`, `depth` or `labels` of some rows [K] (that have it), as in `DriveSet`."""
         number = np.searchsorted(self._first, rows, side='right') - 1
@@ -103,7 +126,8 @@ class Drives:
             here = number == k
             part = getattr(self.sets[k], name)[rows[here] - self._first[k]]
             if found is None:
-                found = np.empty((len(rows), *part.shape[1:]), part.dtype)
+                kind = (label_dtype(self.classes) if name == 'labels' else part.dtype)
+                found = np.empty((len(rows), *part.shape[1:]), kind)
             found[here] = part
         assert found is not None  # there is a row
         return found

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vn_nav.errors import UserError
+from vn_nav.labels import CLASSES, MAX_CLASSES
 
 GREY = (0.299, 0.587, 0.114)  # luma of ITU-R BT.601
 # Candidate colours: hues, saturations and brightnesses of a grid in HSB.
@@ -79,7 +80,7 @@ def label_target(labels: Tensor, colours: Tensor, cells: int, cell: int = 4) -> 
     Labels become colours before anything is averaged: between two classes lies no third one.
 
     Args:
-        labels: [N,H,W] uint8 classes.
+        labels: [N,H,W] uint8 or uint16 classes.
         colours: [classes,3] float32, `label_colours`.
         cells, cell: as in `pixel_change`.
 
@@ -96,17 +97,26 @@ def label_colours(count: int) -> Tensor:
     """Colours of classes, spread as far apart as possible in HSB (thesis 4.4).
 
     Distances are taken in the cone of hue, saturation and brightness, where all blacks are one
-    point. Each colour in turn is taken farthest from those before; then single colours move to
-    better places while that increases their distance to the nearest other one. Class 0 is black.
+    point. Class 0 is black. Few colours are placed one by one; many lie on the lattice of the
+    densest packing of balls, which then keeps more distance and takes no time.
 
     Returns:
         [count,3] float32 RGB in [0, 1]; equal on every call.
 
     Raises:
-        UserError: more classes than a uint8 label has.
+        UserError: more classes than a uint16 label has.
     """
-    if not 1 <= count <= 256:
-        raise UserError('a label map has 1 to 256 classes', count, 'name fewer classes')
+    if not 1 <= count <= MAX_CLASSES:
+        raise UserError(f'a label map has 1 to {MAX_CLASSES} classes', count,
+                        'name fewer classes')
+    return _placed_colours(count) if count <= CLASSES else _packed_colours(count)
+
+
+def _placed_colours(count: int) -> Tensor:
+    """Each colour in turn farthest from those before; then single ones move while that helps.
+
+    Up to `CLASSES` of them these are the colours that published weights draw.
+    """
     points, rgb = _candidates()
     distance = torch.cdist(points, points)
     chosen = [0]
@@ -124,6 +134,38 @@ def label_colours(count: int) -> Tensor:
     return rgb[chosen]
 
 
+def _packed_colours(count: int) -> Tensor:
+    """Points of a face-centred cubic lattice in the HSB cone, as wide as leaves enough of them."""
+    least, most = 0.0, 1.0  # half a diagonal of the lattice: enough points, too few
+    for _ in range(30):
+        middle = (least + most) / 2
+        if middle > 0.01 and len(_lattice(middle)) < count:
+            most = middle
+        else:
+            least = middle
+    points = _lattice(least)
+    # Neighbouring numbers are not neighbouring colours; the apex, black, stays the first.
+    turn = (torch.arange(len(points), dtype=torch.float64) * ((math.sqrt(5) - 1) / 2)) % 1
+    x, y, brightness = points[turn.argsort(stable=True)[:count]].unbind(1)
+    return _rgb(torch.atan2(y, x) / (2 * math.pi) % 1, torch.hypot(x, y), brightness).float()
+
+
+def _lattice(step: float) -> Tensor:
+    """Points [N,3] of the HSB cone with whole coordinates of an even sum, in units of `step`."""
+    across = torch.arange(-math.floor(1 / step), math.floor(1 / step) + 1)
+    up = torch.arange(0, math.floor(1 / step) + 1)
+    whole = torch.stack(torch.meshgrid(up, across, across, indexing='ij'), dim=-1).view(-1, 3)
+    z, y, x = whole.unbind(1)
+    return whole[(whole.sum(1) % 2 == 0) & (x * x + y * y <= z * z)].flip(1) * float(step)
+
+
+def _rgb(hue: Tensor, chroma: Tensor, brightness: Tensor) -> Tensor:
+    """RGB [N,3] of HSB: each channel falls from the brightness by the chroma, off its own hue."""
+    sector = (torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64) + 6 * hue[:, None]) % 6
+    fall = torch.minimum(sector, 4 - sector).clamp(0, 1)
+    return brightness[:, None] - chroma[:, None] * fall
+
+
 def _candidates() -> tuple[Tensor, Tensor]:
     """Points of the HSB cone [N,3] and their RGB [N,3]; black is the first."""
     steps = torch.arange(1, LEVELS + 1, dtype=torch.float64) / LEVELS
@@ -133,10 +175,7 @@ def _candidates() -> tuple[Tensor, Tensor]:
     chroma = saturation * brightness
     angle = 2 * math.pi * hue
     points = torch.stack([chroma * angle.cos(), chroma * angle.sin(), brightness], dim=1)
-    # RGB of HSB: each channel falls from the brightness by the chroma, away from its own hue.
-    sector = (torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64) + 6 * hue[:, None]) % 6
-    fall = torch.minimum(sector, 4 - sector).clamp(0, 1)
-    rgb = brightness[:, None] - chroma[:, None] * fall
+    rgb = _rgb(hue, chroma, brightness)
     greys = torch.cat([torch.zeros(1, dtype=torch.float64), steps])
     on_axis = torch.stack([torch.zeros_like(greys), torch.zeros_like(greys), greys], dim=1)
     return (torch.cat([on_axis, points]),

@@ -23,6 +23,7 @@ import re
 import typing
 
 from vn_nav.errors import UserError
+from vn_nav.labels import CLASSES
 from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.encoders import LARGE
@@ -138,19 +139,22 @@ class TrainConfig(LearnerConfig):
                 raise UserError(rule, received, 'correct the training configuration')
 
     def network(self, actions: tuple[str, ...], size: int,
-                moves: tuple[tuple[float, float, float], ...] = ()) -> NetworkConfig:
+                moves: tuple[tuple[float, float, float], ...] = (),
+                classes: int = CLASSES) -> NetworkConfig:
         """The network for a robot's actions and a picture size, with the heads of the tasks.
 
         Args:
             actions: names; size: side of the pictures [pixels].
             moves: what the actions do, see `NetworkConfig.moves`; for `track_goal` alone.
+            classes: of the labels that segmentation heads draw.
         """
         deconvolutions = self.deconvolutions or (1 if size < LARGE else 2)
         heads = dict.fromkeys((*self.heads, *self.extra_heads))
         return NetworkConfig(
             actions=actions, size=size, architecture=self.architecture, channels=self.channels,
             blocks=self.blocks, features=self.features, hidden=self.hidden,
-            frames=self.stacked_frames, heads=tuple(heads), deconvolutions=deconvolutions,
+            frames=self.stacked_frames, heads=tuple(heads), classes=classes,
+            deconvolutions=deconvolutions,
             pose_to_memory=self.pose_to_memory, places=self.places,
             moves=moves if self.track_goal else (),
             action_filter='' if self.action_filter else NONE, pixel_mean=self.pixel_mean,

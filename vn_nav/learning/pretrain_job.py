@@ -18,11 +18,13 @@ from vn_nav.bags.drive import RECORDED
 from vn_nav.bags.mapping.recorded_place import scene_of
 from vn_nav.bags.roles import Topics
 from vn_nav.errors import UserError
+from vn_nav.labels import CLASSES
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split
 from vn_nav.learning.precision import fast_dtype
 from vn_nav.learning.presets import TrainConfig, preset
 from vn_nav.learning.pretraining import PretrainConfig, choose_parts, pretrain_network
 from vn_nav.learning.supervised import PARTS
+from vn_nav.learning.transfer import SEGMENTATIONS, initial_weights
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
@@ -96,12 +98,19 @@ def pretrain(job: PretrainJob, *, say: Callable[[str], None] = print_line) -> Pa
     for line in (*words, told.words, f'learns {", ".join(parts).replace("_", " ")}'):
         say(line)
     torch.set_num_threads(train.threads)
-    policy = _policy(network, parts, given, numbers.seed).to(train.device)
+    names: tuple[str, ...] = () if given is None else tuple(given.info['label_names'])
+    if set(parts) & set(SEGMENTATIONS):
+        names = drives.label_names
+        network = dataclasses.replace(network, classes=max(CLASSES, drives.classes))
+    policy, words = _policy(network, parts, job.init, numbers.seed, names)
+    for line in words:
+        say(f'{job.init}: {line}')
+    policy.to(train.device)
     policy.compute_dtype = fast_dtype(train.device)
     info = {
         'world_version': worlds.pop() if len(worlds) == 1 else RECORDED,
         'camera_fov_deg': math.degrees(robot.camera_fov), 'camera_height': robot.camera_height,
-        'preset': train.preset, 'command': job.command,
+        'preset': train.preset, 'command': job.command, 'label_names': list(names),
         'data': _data(bags, drives, told, Path(job.init) if job.init else None),
         'notes': f'Pre-trained on {len(drives):,} steps of {len(job.bags)} bag'
                  f'{"s" * (len(job.bags) > 1)}: {", ".join(parts).replace("_", " ")}; '
@@ -169,16 +178,21 @@ def _robot_and_network(job: PretrainJob, given: LoadedCheckpoint | None,
     return robot.with_actions(network.actions, network.moves), network
 
 
-def _policy(network: NetworkConfig, parts: Sequence[str], given: LoadedCheckpoint | None,
-            seed: int) -> Policy:
-    """The network with a head for each part; with a checkpoint's weights, where it has them."""
+def _policy(network: NetworkConfig, parts: Sequence[str], init: str | Path | None, seed: int,
+            label_names: Sequence[str]) -> tuple[Policy, list[str]]:
+    """The network with a head for each part; with a checkpoint's weights, where it has them.
+
+    And what it has not, in words.
+    """
     heads = [part for part in parts if part != 'cloning' and part not in network.heads]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         policy = Policy(dataclasses.replace(network, heads=(*network.heads, *heads)))
-    if given is not None:
-        policy.load_state_dict(policy.state_dict() | given.network.state_dict())
-    return policy
+    if init is None:
+        return policy, []
+    start = initial_weights(init, policy, label_names)
+    policy.load_state_dict(start.weights)
+    return policy, start.words
 
 
 def _data(bags: Sequence[Path], drives: Drives, told: Split, init: Path | None) -> str:

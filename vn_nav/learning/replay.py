@@ -24,7 +24,8 @@ from vn_nav.learning.replay_files import RingFiles
 from vn_nav.learning.rollout import Rollout
 from vn_nav.observation import Observation
 
-PICTURES = ('depth', 'segmentation')  # what may be kept beside the observation, [S,S] uint8
+# What may be kept beside the observation, [S,S]: depth as uint8, segmentation as its ids come.
+PICTURES = ('depth', 'segmentation')
 LAYOUT = 1  # of the files
 
 
@@ -49,9 +50,10 @@ class Replay:
         goals: [G,3,S,S] uint8, the table that every rollout's `goal_index` points into; kept by
             reference, once. None: a task without goal pictures.
         privileged: which of `PICTURES` the rollouts bring and the memory keeps.
-        goal_segmentation: [G,S,S] uint8 classes of the goal pictures, if an image head needs
+        goal_segmentation: [G,S,S] classes of the goal pictures, if an image head needs
             them: looked up like the goals, not kept for each step.
         max_depth: depth that is stored as 255 [m].
+        label_type: of the class ids in segmentations, torch.uint8 or torch.uint16.
         directory: where the rings live as memory-mapped files, so that a resumed training finds
             them. They survive a killed process at any moment; for a power cut call `flush`
             before the checkpoint is written. None: in memory only.
@@ -68,8 +70,8 @@ class Replay:
 
     def __init__(self, capacity: int, num_envs: int, size: int, goals: Tensor | None, *,
                  privileged: tuple[str, ...] = PICTURES, goal_segmentation: Tensor | None = None,
-                 max_depth: float = 10.0, directory: Path | None = None,
-                 device: torch.device | str = 'cpu'):
+                 max_depth: float = 10.0, label_type: torch.dtype = torch.uint8,
+                 directory: Path | None = None, device: torch.device | str = 'cpu'):
         if capacity < 2 or num_envs < 1:
             raise UserError('a replay memory keeps at least two steps of one environment',
                             (capacity, num_envs), 'make it larger')
@@ -79,11 +81,12 @@ class Replay:
         self.capacity, self.num_envs, self.size = capacity, num_envs, size
         self.goals, self.goal_segmentation = goals, goal_segmentation
         self.privileged, self.max_depth = tuple(privileged), max_depth
+        self.label_type = label_type
         self.device = torch.device(device)
         self.resumed: str | None = None
         self.total = self.count = 0  # rows ever appended; readable ones, the newest of them
         self._steps: dict[int, tuple[Tensor, Tensor]] = {}
-        layout = self._layout(capacity, num_envs, size, self.privileged)
+        layout = self._layout(capacity, num_envs, size, self.privileged, label_type)
         self._files = (None if directory is None
                        else RingFiles(Path(directory), self._header()))
         if self._files is None:
@@ -93,7 +96,8 @@ class Replay:
             self.rings = self._files.open(layout)
 
     @staticmethod
-    def _layout(capacity: int, num_envs: int, size: int, privileged: tuple[str, ...]
+    def _layout(capacity: int, num_envs: int, size: int, privileged: tuple[str, ...],
+                label_type: torch.dtype = torch.uint8
                 ) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
         """Type and shape of every ring."""
         for name in privileged:
@@ -104,7 +108,8 @@ class Replay:
         return {
             'serial': (torch.int64, (capacity,)),
             'image': (torch.uint8, (*row, *picture, 3)),  # as the convolutions read them
-            **{name: (torch.uint8, (*row, *picture)) for name in privileged},
+            **{name: (label_type if name == 'segmentation' else torch.uint8, (*row, *picture))
+               for name in privileged},
             'age': (torch.int32, row),
             'goal_index': (torch.int32, row),
             'last_action': (torch.int16, row),
@@ -116,10 +121,11 @@ class Replay:
 
     @classmethod
     def bytes_needed(cls, capacity: int, num_envs: int, size: int,
-                     privileged: tuple[str, ...] = PICTURES) -> int:
+                     privileged: tuple[str, ...] = PICTURES,
+                     label_type: torch.dtype = torch.uint8) -> int:
         """Bytes of such a memory's rings, without making it."""
         return sum(math.prod(shape) * dtype.itemsize for dtype, shape in
-                   cls._layout(capacity, num_envs, size, privileged).values())
+                   cls._layout(capacity, num_envs, size, privileged, label_type).values())
 
     @property
     def nbytes(self) -> int:
@@ -157,6 +163,9 @@ class Replay:
             'terminated': rollout.terminated, 'truncated': rollout.truncated,
             'age': self._ages(rollout.starts[:steps]),
         }
+        if 'segmentation' in rows and rows['segmentation'].dtype != self.label_type:
+            raise UserError(f'segmentations of this memory are {self.label_type}',
+                            rows['segmentation'].dtype, 'make one for such labels (label_type)')
         if 'depth' in rows:
             rows['depth'] = encode_depth(rows['depth'][:steps], self.max_depth)
         if not self.total:
@@ -205,8 +214,8 @@ class Replay:
 
         Returns:
             [length+1,batch] observations. `starts` only where an episode really begins; `state`
-            is None: the consumer begins with zeros. `privileged` pictures are uint8 (depth: 255
-            is `max_depth`) and hold `goal_segmentation` where the memory has its table.
+            is None: the consumer begins with zeros. `privileged` pictures are as they are stored
+            (depth: 255 is `max_depth`) and hold `goal_segmentation` where there is its table.
 
         Raises:
             UserError: nothing is stored yet.
@@ -360,7 +369,9 @@ class Replay:
                 digest.update(table.cpu().numpy().tobytes())
         return {'layout': LAYOUT, 'capacity': self.capacity, 'num_envs': self.num_envs,
                 'size': self.size, 'privileged': list(self.privileged),
-                'max_depth': self.max_depth, 'goals': digest.hexdigest()}
+                'max_depth': self.max_depth, 'goals': digest.hexdigest(),
+                # Files of before there was a choice know no such key.
+                **({} if self.label_type == torch.uint8 else {'labels': str(self.label_type)})}
 
     def _take_over(self) -> None:
         self.rings['serial'].fill_(-1)

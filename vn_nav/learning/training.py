@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.labels import CLASSES, label_dtype
 from vn_nav.learning.bag_mix import BagMix
 from vn_nav.learning.curriculum import Curriculum, FrameCurriculum
 from vn_nav.learning.distributed import Processes
@@ -28,11 +29,12 @@ from vn_nav.learning.presets import TrainConfig
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector, Episode, Rollout
 from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
-from vn_nav.learning.training_state import initial_weights, restore, state_of
+from vn_nav.learning.training_state import restore, state_of
+from vn_nav.learning.transfer import SEGMENTATIONS, initial_weights
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.resnet import load_frozen_weights
 from vn_nav.policy.zhu_policy import ScenePolicy, build_policy
-from vn_nav.vector_env import GoalLabelsEnv, NavigationVectorEnv
+from vn_nav.vector_env import GoalLabelsEnv, LabelledEnv, NavigationVectorEnv
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
 FAILED_BATCH, PAIRS = 'failed_batch.pt', 'pairs'
@@ -50,15 +52,22 @@ class Training:
                  processes: Processes, bags: BagMix | None = None):
         torch.set_num_threads(config.threads)
         if bags is not None:
+            settle_labels(env, bags)
             config = dataclasses.replace(config, extra_heads=(*config.extra_heads, *bags.heads))
         self.bags, self.columns = bags, COLUMNS + (() if bags is None else bags.columns)
         self.env, self.config, self.folder, self.processes = env, config, folder, processes
         self.info = {**info, 'seed': config.seed, 'world_version': env.world_version}
         size = env.goals.shape[-1]
+        self.label_names = self._label_names()
+        self.classes = max(CLASSES, len(self.label_names),
+                           0 if bags is None else bags.classes)
+        if self.label_names:
+            self.info['label_names'] = list(self.label_names)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = build_policy(config.network(
-                tuple(env.action_names), size, env.robot.moves if config.track_goal else ()))
+                tuple(env.action_names), size, env.robot.moves if config.track_goal else (),
+                self.classes))
         if config.frozen_weights:
             assert isinstance(self.network, ScenePolicy)  # no other has a frozen encoder
             load_frozen_weights(self.network.encoder.frozen, config.frozen_weights)
@@ -93,6 +102,12 @@ class Training:
         self.frames, self.updates, self.seconds = 0, 0, 0.0
         self.clock = time.monotonic()
 
+    def _label_names(self) -> tuple[str, ...]:
+        """Behind the classes that segmentation heads draw; empty: there are none, or unknown."""
+        if not {*self.config.heads, *self.config.extra_heads} & set(SEGMENTATIONS):
+            return ()
+        return named_classes(self.env) or (() if self.bags is None else self.bags.label_names)
+
     def _replay(self, size: int) -> Replay | None:
         config, env = self.config, self.env
         if not config.from_replay:
@@ -115,7 +130,7 @@ class Training:
             env.num_envs, size, table(env.goals),
             privileged=tuple(key for key in config.privileged
                              if key in ('depth', 'segmentation')),
-            goal_segmentation=labels,
+            goal_segmentation=labels, label_type=_label_type(len(named_classes(env))),
             # Files are the leading process's matter; resumed, all are to have the same share.
             directory=self.folder / REPLAY if files and device.type == 'cpu' else None,
             device=device)
@@ -129,7 +144,10 @@ class Training:
             return
         if self.processes.leads:
             if init is not None:
-                self.network.load_state_dict(initial_weights(init, self.network))
+                start = initial_weights(init, self.network, self.label_names)
+                self.network.load_state_dict(start.weights)
+                for line in start.words:
+                    print(f'{init}: {line}', flush=True)
             if self.config.pair_minutes and pairs is not None:
                 self._learn_pairs(*pairs())
         self.processes.copy_weights(self.network)
@@ -257,6 +275,24 @@ class Training:
         write_state(self.folder / STATE, state_of(self))
         save_checkpoint(self.folder / CHECKPOINT, self.network, {
             **self.info, 'frames': self.frames, 'minutes': round(self.seconds / 60, 2)})
+
+
+def named_classes(env: NavigationVectorEnv) -> tuple[str, ...]:
+    """Names of an environment's classes of labels; empty: it has none, or nobody says."""
+    return tuple(env.label_names) if isinstance(env, LabelledEnv) else ()
+
+
+def settle_labels(env: NavigationVectorEnv, bags: BagMix) -> None:
+    """Have bags teach no segmentation where their classes are known to be others than here."""
+    own = named_classes(env)
+    if own and bags.label_names and own != bags.label_names:
+        for name in bags.leave_out(SEGMENTATIONS):
+            print(f'bags do not teach {name}: their classes of labels are others than those of '
+                  f'{env.simulator_name}', flush=True)
+
+
+def _label_type(classes: int) -> torch.dtype:
+    return {1: torch.uint8, 2: torch.uint16}[label_dtype(classes).itemsize]
 
 
 def _mean(values) -> float:

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.labels import CLASSES
 from vn_nav.learning.rollout import Episode, Rollout
-from vn_nav.policy.checkpoint import load_checkpoint
-from vn_nav.policy.network import Policy
 from vn_nav.vector_env import RecallingEnv, RestorableEnv
 
 if TYPE_CHECKING:
@@ -116,6 +114,8 @@ def _identity(training: Training) -> dict:
     network = dataclasses.asdict(training.network.config)
     if training.config.action_filter:  # of before there was a choice: they know no such key
         del network['action_filter']
+    if network['classes'] == CLASSES:  # likewise
+        del network['classes']
     return {
         'bags': None if training.bags is None else training.bags.identity,
         'action names': list(network.pop('actions')),
@@ -125,19 +125,3 @@ def _identity(training: Training) -> dict:
         'number of environments': training.env.num_envs,
         'kind of device': training.network.device.type,  # random numbers differ
     }
-
-
-def initial_weights(source: str | Path, network: Policy) -> dict[str, torch.Tensor]:
-    """The weights of a checkpoint, and a network's own for heads that the checkpoint lacks."""
-    own = network.state_dict()
-    given = load_checkpoint(source, network.config.actions).network.state_dict()
-    for name, tensor in own.items():
-        if name not in given and name.startswith('heads.'):
-            given[name] = tensor
-        elif name not in given or given[name].shape != tensor.shape:
-            raise UserError(
-                f'a training begins with a checkpoint of the same network: {name} is '
-                f'{tuple(tensor.shape)}', tuple(given[name].shape) if name in given else 'absent',
-                'choose the same architecture, size, channels, features and hidden, or leave '
-                'out --init')
-    return {name: given[name] for name in own}

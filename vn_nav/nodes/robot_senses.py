@@ -70,6 +70,7 @@ class Senses:
         goal: the goal picture in force [3,S,S]; None: none yet.
         goals: number of goals that were taken.
         scene: what a simulator says of itself; empty: nobody does.
+        label_names: behind the class ids of labels; empty: nobody has said.
         camera_fov: of the pictures [rad]; None: nobody has said.
         frame: stamp [s] and picture, the newest of the present goal.
         tally: what was said since the last decision.
@@ -85,6 +86,7 @@ class Senses:
         self.goal: np.ndarray | None = None
         self.goals = 0
         self.scene: dict = {}
+        self.label_names: tuple[str, ...] = ()
         self.camera_fov: float | None = None
         self.frame: tuple[float, np.ndarray] | None = None
         self.tally = Tally()
@@ -95,6 +97,7 @@ class Senses:
         topics.hear(Bool, 'arrived', self._on_arrived, history=False)
         topics.hear(UInt8, 'episode_end', self._on_episode_end, history=False)
         topics.hear(String, 'scene', self._on_scene)
+        topics.hear(String, 'labels/names', self._on_label_names)
         topics.hear(Image, 'goal_image', self._on_goal, anybody=True)
         # In lock-step no odometry may be missed, and the simulator is reliable.
         topics.hear(Odometry, 'odom', output.take_odometry, anybody=not lock_step)
@@ -185,6 +188,16 @@ class Senses:
             return
         if isinstance(said, dict):
             self.scene = said
+
+    def _on_label_names(self, message: String) -> None:
+        try:
+            said = json.loads(message.data)
+        except ValueError:
+            return
+        if isinstance(said, list) and all(isinstance(name, str) for name in said):
+            with self._wake:
+                self.label_names = tuple(said)
+                self._wake.notify_all()
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         side, focal = min(message.width, message.height), message.k[0]

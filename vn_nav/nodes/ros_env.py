@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from vn_nav.bags.drive import RECORDED
 from vn_nav.errors import EnvironmentLost, UserError
+from vn_nav.labels import CLASSES, label_dtype
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.robot_senses import BESIDE, Seen
 from vn_nav.nodes.ros_robot import RosRobot
@@ -154,6 +155,12 @@ class RosEnv:
         return said.pop() if len(said) == 1 else ROBOT
 
     @property
+    def label_names(self) -> tuple[str, ...]:
+        """Behind the class ids of all robots' labels; empty: nobody says, or they differ."""
+        said = {one.label_names for one in self._robots}
+        return said.pop() if len(said) == 1 else ()
+
+    @property
     def scene_names(self) -> list[str]:
         """Of the first robot's scene; empty: nobody says."""
         scene = self.scene
@@ -252,8 +259,19 @@ class RosEnv:
     def _tell(self, seen: list[Seen], reset, success, collided, arrived) -> dict[str, np.ndarray]:
         told = {key: np.stack([one.beside[key] for one in seen]) for key in self.privileged
                 if key in BESIDE}
+        if 'segmentation' in told:
+            told['segmentation'] = self._as_classes(told['segmentation'])
         return {'reset': reset, 'success': success, 'collided': collided, 'arrived': arrived,
                 **told}
+
+    def _as_classes(self, labels: np.ndarray) -> np.ndarray:
+        """Labels in the type that their classes need."""
+        count = max(CLASSES, len(self.label_names))
+        if labels.max(initial=0) >= count:
+            raise EnvironmentLost(f'labels/image_raw shows classes below {count}: as many as '
+                                  f'labels/names names, or {CLASSES}', int(labels.max()),
+                                  'publish labels/names, or set segmentation=0 (--set NAME=VALUE)')
+        return labels.astype(label_dtype(len(self.label_names)))
 
     def _spin(self) -> None:
         """Serve all robots; a callback that fails stops them."""

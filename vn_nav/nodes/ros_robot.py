@@ -136,6 +136,11 @@ class RosRobot(Node):
         """What a simulator says of itself; empty: nobody does."""
         return self._senses.scene
 
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Behind the class ids of labels; empty: nobody says."""
+        return self._senses.label_names
+
     def _on_stop(self, _request, response):
         with self.wake:
             self._held = True
@@ -182,7 +187,8 @@ class RosRobot(Node):
                  ('odom', self.output.odometry is not None),
                  ('goal_image', self.goal is not None),
                  (f'somebody {self._listener_words()}', self._listeners()),
-                 ('scene', self.scene or not self.count_publishers('scene')))
+                 ('scene', self.scene or not self.count_publishers('scene')),
+                 ('labels/names', self.label_names or not self.count_publishers('labels/names')))
         return [name for name, there in found if not there]
 
     def begin(self) -> Seen:

@@ -38,6 +38,7 @@ INFO: dict[str, Any] = {
     'frames': 0,  # agent decisions
     'minutes': 0.0,  # wall-clock of training
     'command': '',  # that trained it
+    'label_names': [],  # of the classes that segmentation heads draw; empty: nobody knows
     'data': '',  # recorded pictures that it learned from, in words; empty: it learned by driving
     'losses': [],  # what `vn_nav pretrain` learned; no episode was driven
     'results': {},  # measured figures and controls, by name
@@ -58,7 +59,8 @@ TEXT, LIST, INTEGER, NUMBER = (str,), (list, tuple), (int,), (int, float)
 INFO_TYPES = {
     'world_version': Rule(TEXT), 'decoding': Rule(TEXT), 'task': Rule(TEXT),
     'randomisation': Rule(TEXT), 'preset': Rule(TEXT), 'command': Rule(TEXT),
-    'notes': Rule(TEXT), 'results': Rule((dict,)), 'data': Rule(TEXT), 'losses': Rule(LIST),
+    'notes': Rule(TEXT), 'results': Rule((dict,)), 'label_names': Rule(LIST),
+    'data': Rule(TEXT), 'losses': Rule(LIST),
     'scenes': Rule(LIST), 'simulator': Rule(TEXT), 'objects': Rule(INTEGER, 0, 1000),
     'goals_per_room': Rule(INTEGER, 1, 1000), 'goal_variants': Rule(INTEGER, 1, 1000),
     'stop_threshold': Rule(NUMBER, 0, 1), 'seed': Rule(INTEGER, -2**63, 2**64),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from vn_nav.errors import UserError
+from vn_nav.labels import CLASSES, MAX_CLASSES
 from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
 from vn_nav.policy.zhu import FROZEN
 
@@ -29,6 +30,9 @@ class NetworkConfig:
     hidden: int = 256  # of the LSTM
     frames: int = 1  # more: pictures stacked as channels, and no LSTM
     heads: tuple[str, ...] = ()  # of HEADS
+    # Classes of labels: the colours that segmentation heads learn to draw depend on their number,
+    # see `vn_nav.learning.pixel_change.label_colours`.
+    classes: int = CLASSES
     deconvolutions: int = 1  # of pixel control and image heads: 84 px give 20 x 20, or 42 x 42
     pose_to_memory: bool = False  # the memory also sees what the head goal_pose says
     # [A,3] dx, dy [m], dyaw [rad] of the actions: with them the memory also sees where the goal
@@ -70,6 +74,8 @@ class NetworkConfig:
             (1 <= self.frames <= 8, 'a stack has 1 to 8 frames', self.frames),
             (set(self.heads) <= set(HEADS) and len(set(self.heads)) == len(self.heads),
              f'heads are some of {", ".join(HEADS)}, each once', self.heads),
+            (CLASSES <= self.classes <= MAX_CLASSES,
+             f'segmentation heads draw {CLASSES} to {MAX_CLASSES} classes', self.classes),
             (self.deconvolutions in (1, 2), 'heads have one or two deconvolutions',
              self.deconvolutions),
             (not self.pose_to_memory or 'goal_pose' in self.heads,

@@ -18,6 +18,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from vn_msgs_py.camera import intrinsics
+from vn_msgs_py.images import label_encoding
 from vn_msgs_py.motion import yaw_to_quaternion
 from vn_msgs_py.topics import Topic, topic
 from vn_nav.errors import UserError
@@ -233,7 +234,8 @@ class _Bag:
         if 'depth/image_raw' in self._names:
             self._write_image('depth/image_raw', seen.depth, '32FC1')
         if 'labels/image_raw' in self._names:
-            self._write_image('labels/image_raw', seen.labels, 'mono8')
+            self._write_image('labels/image_raw', seen.labels,
+                              label_encoding(seen.labels))
         rgb = seen.rgb.transpose(1, 2, 0)
         self._write_camera_info(*rgb.shape[:2])
         self._write_image('image_raw', rgb, 'rgb8')

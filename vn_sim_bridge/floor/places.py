@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Protocol, TypeGuard, runtime_checkable
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import FloorMap, Rect
-from vn_sim_bridge.simulator import Goal, Place
+from vn_sim_bridge.simulator import Place
 
 if TYPE_CHECKING:
     from vn_sim_bridge.houses.house import Room
@@ -41,23 +40,12 @@ class WalledPlace(FloorPlace, Protocol):
 
 
 @runtime_checkable
-class RoomPlace(Place, Protocol):
+class RoomPlace(FloorPlace, Protocol):
     """A place of a simulator with `capabilities.rooms`."""
 
     @property
     def rooms(self) -> Sequence[Room]:
         """Their names, types and floors."""
-
-
-@runtime_checkable
-class HousePlace(WalledPlace, RoomPlace, Protocol):
-    """A place for every task: objects can be put on its floor and be driven to."""
-
-    def distance_to(self, goal: Goal) -> FloorDistance:
-        """Shortest driving distance from anywhere to a goal."""
-
-    def geodesic(self, x: float, y: float) -> FloorDistance:
-        """Shortest driving distance from anywhere to (x, y)."""
 
 
 def have_floors(places: Sequence[Place]) -> TypeGuard[Sequence[FloorPlace]]:
@@ -84,19 +72,6 @@ def with_rooms(place: Place) -> RoomPlace:
         UserError: it has none.
     """
     if not isinstance(place, RoomPlace):
-        raise UserError('a place of a simulator that knows rooms has rooms', place.name,
+        raise UserError('a place of a simulator that knows rooms has rooms and floor', place.name,
                         'add them, or declare rooms=False')
-    return place
-
-
-def as_house(place: Place) -> HousePlace:
-    """The place, where a task puts objects or asks for rooms.
-
-    Raises:
-        UserError: it lacks something for that.
-    """
-    if not isinstance(place, HousePlace):
-        raise UserError('a place for objects and rooms has floor, obstacles, obstacle_rects, '
-                        'rooms and geodesic, as a house does', place.name,
-                        'choose the task image')
     return place

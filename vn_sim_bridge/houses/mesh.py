@@ -14,7 +14,7 @@ from vn_sim_bridge.houses.gltf import read_gltf
 from vn_sim_bridge.houses.labels import LABEL, LABELS
 from vn_sim_bridge.houses.obj import read_obj
 from vn_sim_bridge.houses.surface import MAX_TRIANGLES, Part
-from vn_sim_bridge.render.scene import Scene, TextureSet, uniform_light
+from vn_sim_bridge.render.scene import Scene, TextureSet, as_labels, uniform_light
 
 GROUP = 64  # triangles culled together
 READERS = {'.obj': read_obj, '.glb': read_gltf, '.gltf': read_gltf}
@@ -185,7 +185,7 @@ def _scene(parts: list[Part], class_ids: list[int], path: Path, up: str, scale: 
         face_uv=face_uv.astype(np.float32),
         face_texture=textures[order].astype(np.int32),
         face_colour=colour[order].astype(np.float32),
-        face_label=labels[order].astype(np.uint8),
+        face_label=as_labels(labels[order]),
         face_instance=instances[order].astype(np.uint16),
         face_light=face_light, face_light_map=light_map, light=light,
         group_start=group_start.astype(np.int32),

@@ -1,4 +1,4 @@
-"""`NavigationEnv`: many robots with a task, in houses or other places, as a VectorEnv."""
+"""`NavigationEnv`: many robots with a task in the places of a simulator, as a VectorEnv."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from gymnasium.vector.utils import batch_space
 
 from vn_nav.co_visibility import GRID, co_visible, lift, relative_pose
 from vn_nav.errors import UserError
+from vn_nav.labels import label_dtype
 from vn_nav.reset_arguments import are_several, read_options, read_seed, read_seeds
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream, key, normal, uniform
 from vn_sim_bridge.floor.contacts import motion_noise
 from vn_sim_bridge.floor.floor_map import CELL
-from vn_sim_bridge.floor.places import as_house, have_floors, walled
+from vn_sim_bridge.floor.places import have_floors, walled, with_rooms
 from vn_sim_bridge.navigation import tasks
-from vn_sim_bridge.navigation.env_config import EnvConfig, check_simulator
+from vn_sim_bridge.navigation.env_config import EnvConfig, check_simulator, objects_of, setup_for
 from vn_sim_bridge.navigation.episodes import draw_grip, draw_motion_scale, draw_variant
 from vn_sim_bridge.navigation.explorer import Explorer
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
 from vn_sim_bridge.navigation.oracle import FloorOracle, turning_table
 from vn_sim_bridge.navigation.tasks import BLANK, RIGHT, WRONG
-from vn_sim_bridge.simulator import Frames, Motion, Setup, Simulator
+from vn_sim_bridge.simulator import Frames, Motion, Simulator
 from vn_sim_bridge.simulators import open_simulator
 
 SQUARE = 1.0  # m, side of the squares of floor that exploration counts
@@ -76,11 +77,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.config = config = config or EnvConfig()
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs = n = config.num_envs
-        self.simulator: Simulator = simulator or open_simulator(config.scenes, Setup(
-            num_envs=n, robot=self.robot, size=config.size, threads=threads,
-            randomisation=config.randomisation, models=tasks.MODELS[config.task],
-            objects=config.objects if tasks.MODELS[config.task] else 0,
-            goals_per_room=config.goals_per_room, goal_seed=config.goal_seed))
+        self.simulator: Simulator = simulator or open_simulator(
+            config.scenes, setup_for(config, self.robot, threads))
         try:
             check_simulator(self.simulator, config, self.robot, given=simulator is not None)
         except UserError:
@@ -134,6 +132,11 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """[N] the place of each robot."""
         return self.simulator.place_index
 
+    @property
+    def label_names(self) -> Sequence[str]:
+        """Behind the ids of segmentations; none where the simulator has no labels."""
+        return self.simulator.label_names if self.simulator.capabilities.labels else ()
+
     def _make_explorer(self) -> Explorer:
         if self.config.task != 'image':
             raise UserError('the explorer looks for the place of a picture (task image)',
@@ -149,15 +152,17 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if config.task == 'image':
             return tasks.ImageGoal(self.places, config.num_envs, min_distance=distance,
                                    fixed_goals=config.one_goal_per_env)
-        common = list(map(as_house, self.places)), config.num_envs
+        models = objects_of(self.simulator, config.task)
         if config.task == 'object':
             return tasks.ObjectGoal(
-                *common, models=tasks.MODELS['object'], objects=config.objects,
+                self.places, config.num_envs, models=models, objects=config.objects,
                 pictures=max(4, config.pictures_per_goal), min_distance=distance,
                 seed=config.seed)
         if config.task == 'room':
-            return tasks.RoomGoal(*common, must_see=config.room_must_see, min_distance=distance)
-        return tasks.Collect(*common, objects=config.objects)
+            return tasks.RoomGoal(list(map(with_rooms, self.places)), config.num_envs,
+                                  must_see=config.room_must_see, min_distance=distance,
+                                  label_names=self.label_names)
+        return tasks.Collect(self.places, config.num_envs, models=models, objects=config.objects)
 
     def _make_goals(self) -> None:
         """The pictures of all views, each in some lights of its own."""
@@ -167,7 +172,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._variants = self.config.pictures_per_goal
         size, count = self.config.size, len(views) * self._variants
         self.goals = np.full((count + 1, 3, size, size), 128, np.uint8)
-        self.goal_segmentation = np.zeros((count + 1, size, size), np.uint8)
+        self.goal_segmentation = np.zeros((count + 1, size, size),
+                                          label_dtype(len(self.label_names)))
         self.blank_goal = count
         wanted = self.simulator.capabilities.depth and bool(
             {'overlap', 'explorer_action'} & set(self.config.privileged))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
+from typing import Any
 
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -10,11 +12,16 @@ from vn_nav.scenes import one_simulator
 from vn_sim_bridge.floor.places import have_floors
 from vn_sim_bridge.navigation.episodes import MIN_START_DISTANCE
 from vn_sim_bridge.render.randomisation import Randomisation
-from vn_sim_bridge.simulator import Simulator
+from vn_sim_bridge.simulator import BaseSimulator, Setup, Simulator
+from vn_sim_bridge.simulators import simulator_class
 
 TASKS = ('image', 'object', 'room', 'collect')
 PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
               'overlap', 'explorer_action', 'oracle_regret')
+# What not every simulator can do, and what it lacks then.
+OPTIONAL = {'progress_reward': 'the simulator knows no driving distances',
+            'exploration_reward': 'the simulator has no floor map',
+            'randomisation': 'light and camera do not vary in this simulator'}
 STOPS = ('arrival', 'declared')
 
 
@@ -77,6 +84,63 @@ class EnvConfig:
         return self.goal_variants or self.randomisation.pictures_per_goal
 
 
+def setup_for(config: EnvConfig, robot: RobotSpec, threads: int = 1) -> Setup:
+    """What the simulator of an environment is opened with."""
+    name, _ = one_simulator(config.scenes)
+    models = simulator_class(name).task_objects.get(config.task, ())
+    return Setup(
+        num_envs=config.num_envs, robot=robot, size=config.size, threads=threads,
+        randomisation=config.randomisation, models=models,
+        objects=config.objects if models else 0, goals_per_room=config.goals_per_room,
+        goal_seed=config.goal_seed)
+
+
+def objects_of(simulator: Simulator, task: str) -> tuple[str, ...]:
+    """Names of the objects that a task places."""
+    return getattr(simulator, 'task_objects', {}).get(task, ())
+
+
+def tells(simulator: Simulator) -> set[str]:
+    """What of `PRIVILEGED` a simulator knows."""
+    can = simulator.capabilities
+    # Poses alone may say what two pictures share; `BaseSimulator` does not know how.
+    shared = can.depth or type(simulator).co_visibility is not BaseSimulator.co_visibility
+    known = {
+        'depth': can.depth, 'segmentation': can.labels, 'goal_segmentation': can.labels,
+        'oracle_action': can.geodesic or simulator.planner is not None,
+        'oracle_regret': simulator.planner is not None, 'explorer_action': can.walls and shared,
+        'goal_pose': shared, 'overlap': shared}
+    return {name for name in PRIVILEGED if known[name]}
+
+
+def without_the_unknown(config: EnvConfig, simulator: Simulator, optional: Collection[str]
+                        ) -> tuple[EnvConfig, list[str]]:
+    """A configuration that asks a simulator for nothing that it does not know.
+
+    Args:
+        config: what is wished for. Its `privileged` become those that the simulator `tells`.
+        simulator: where.
+        optional: of `OPTIONAL`, what may be left out.
+
+    Returns:
+        The configuration, and what of `optional` is left out, in words.
+    """
+    known = tells(simulator)
+    can = simulator.capabilities
+    without: dict[str, Any] = {
+        'progress_reward': 0.0, 'exploration_reward': 0.0,
+        'randomisation': config.randomisation.of_the_base()}
+    asked = {'progress_reward': config.progress_reward and not can.geodesic,
+             'exploration_reward': (config.exploration_reward
+                                    and not have_floors(simulator.places)),
+             'randomisation': config.randomisation.varies_pictures and not can.appearance}
+    lost = [name for name in optional if asked[name]]
+    words = [f'{name} is left out: {OPTIONAL[name]}' for name in lost]
+    return dataclasses.replace(
+        config, privileged=tuple(name for name in config.privileged if name in known),
+        **{name: without[name] for name in lost}), words
+
+
 def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *,
                     given: bool = False) -> None:
     """Whether a simulator can do what a configuration asks for.
@@ -98,6 +162,8 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
          config.task),
         (can.placeable_objects or config.task not in ('object', 'collect'),
          'this task needs a simulator that places objects', config.task),
+        (config.task not in ('object', 'collect') or objects_of(simulator, config.task),
+         'a simulator that places objects names those of the task (task_objects)', config.task),
         (can.labels or not config.room_must_see, 'room_must_see needs labels', 'none'),
         (image or not can.rewards, 'a simulator that pays itself has the task image',
          config.task),

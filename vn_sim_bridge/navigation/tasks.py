@@ -2,7 +2,7 @@
 
 | task | goal picture | success |
 |---|---|---|
-| `image` | a view in the house | at the pose it was taken from |
+| `image` | a view in the place | at the pose it was taken from |
 | `object` | an object, taken elsewhere | within 1 m of it, wherever it was put (thesis, 5.6) |
 | `room` | a view in a room of some type | in any room of that type (thesis, 5.7) |
 | `collect` | none | none: apples +1, lemons -1 until the limit (thesis, 5.4) |
@@ -25,11 +25,10 @@ from vn_nav.arrival import (  # noqa: F401
     heading_error,
     wrap_angle,
 )
+from vn_nav.errors import UserError
 from vn_sim_bridge.counter_random import Stream, uniform
 from vn_sim_bridge.floor.distance import FloorDistance
-from vn_sim_bridge.floor.places import HousePlace
-from vn_sim_bridge.houses.labels import LABEL
-from vn_sim_bridge.houses.objects import GOAL_OBJECTS
+from vn_sim_bridge.floor.places import RoomPlace
 from vn_sim_bridge.navigation.episodes import (
     GoalField,
     Starts,
@@ -37,7 +36,7 @@ from vn_sim_bridge.navigation.episodes import (
     draw_index,
     draw_wrong_goal,
 )
-from vn_sim_bridge.simulator import Distance, Place, Placed
+from vn_sim_bridge.simulator import Distance, Goal, Place, Placed, StraightDistance
 
 OBJECT_RADIUS = 1.0  # m, geodesic (thesis, 5.6)
 COLLECT_RADIUS = 0.45  # m, straight: the robot's rim touches the fruit
@@ -45,9 +44,6 @@ VISIBLE_SHARE = 0.045  # of the picture that shows the room's objects (House3D)
 VISIBLE_STEPS = 2  # decisions in a row
 FIELDS_KEPT = 512  # of `ImageGoal`, 0.1 MB each; a thousand others take 0.7 s to solve again
 RIGHT, WRONG, BLANK = 'right', 'wrong', 'blank'
-
-# Names of the objects that a task places.
-MODELS = {'image': (), 'object': GOAL_OBJECTS, 'room': (), 'collect': ('apple', 'lemon')}
 
 # What tells a room's type, for the rule of House3D's code.
 ROOM_OBJECTS = {
@@ -80,10 +76,24 @@ def shaping_reward(before, after, collided, success=False, *, progress: float, c
             + np.where(success, goal, step)).astype(np.float32)
 
 
-def shows_room(labels: np.ndarray, kind: str) -> np.ndarray:
-    """Whether pictures' labels [K,H,W] show enough of a room type's objects, [K] bool."""
-    wanted = [LABEL[name] for name in ROOM_OBJECTS[kind]]
-    return np.isin(labels, wanted).mean(axis=(1, 2)) >= VISIBLE_SHARE
+def room_classes(label_names: Sequence[str], kind: str) -> list[int]:
+    """The classes that tell a room's type.
+
+    Raises:
+        UserError: a type that nobody knows objects of, or no object of it has a class.
+    """
+    wanted = ROOM_OBJECTS.get(kind, ())
+    found = [label for label, name in enumerate(label_names) if name in wanted]
+    if not found:
+        raise UserError('room_must_see needs classes of objects that tell the type of a room: '
+                        + (', '.join(wanted) or f'it knows {", ".join(ROOM_OBJECTS)}'),
+                        kind, 'leave out room_must_see, or name the classes so')
+    return found
+
+
+def shows_room(labels: np.ndarray, classes: Sequence[int]) -> np.ndarray:
+    """Whether pictures' labels [K,H,W] show enough of a room's objects, [K] bool."""
+    return np.isin(labels, classes).mean(axis=(1, 2)) >= VISIBLE_SHARE
 
 
 class View(NamedTuple):
@@ -122,7 +132,7 @@ class Situation(NamedTuple):
     distance: np.ndarray  # [N] geodesic, to the goal [m]
     heading_error: np.ndarray  # [N] rad
     poses: np.ndarray  # [N,4]
-    labels: np.ndarray  # [N,H,W] uint8, of the pictures
+    labels: np.ndarray  # [N,H,W] uint8 or uint16, of the pictures
     object_model: np.ndarray  # [N,M] int64; -1: absent
     object_xy: np.ndarray  # [N,M,2] m
     declared: np.ndarray | None = None  # [N] bool: robots that say so; None: arriving is enough
@@ -146,18 +156,18 @@ class Task(Protocol):
 
 
 class _Pool:
-    """The views of each house, side by side."""
+    """The views of each place, side by side."""
 
     def __init__(self):
         self.views: list[View] = []
-        self.ranges: list[tuple[int, int]] = []  # first view and their number, by house
+        self.ranges: list[tuple[int, int]] = []  # first view and their number, by place
         self.models: tuple[str, ...] = ()
         self.objects = 0
         self.state: dict[str, np.ndarray] = {}
 
-    def pick(self, house: int, counter, mode: str, fixed: int | None = None) -> tuple[int, int]:
+    def pick(self, place: int, counter, mode: str, fixed: int | None = None) -> tuple[int, int]:
         """The true goal's view and the shown one (-1: blank)."""
-        first, count = self.ranges[house]
+        first, count = self.ranges[place]
         local = draw_goal(count, *counter) if fixed is None else fixed % count
         shown = draw_wrong_goal(count, local, *counter) if mode == WRONG else local
         return first + local, -1 if mode == BLANK else first + shown
@@ -187,9 +197,9 @@ class ImageGoal(_Pool):
 
         self.goal_field = goal_field  # of a view
 
-    def begin(self, env, house, counter, tau, mode) -> Episode:
+    def begin(self, env, place, counter, tau, mode) -> Episode:
         """Draw goal and start."""
-        goal, shown = self.pick(house, counter, mode,
+        goal, shown = self.pick(place, counter, mode,
                                 env // self.places if self.fixed_goals else None)
         entry = self.goal_field(goal)
         return Episode(goal, shown, entry.start(tau, *counter), entry.field, entry.goal.pose[2])
@@ -205,22 +215,22 @@ class ImageGoal(_Pool):
 class ObjectGoal(_Pool):
     """To within 1 m of an object that lies somewhere else in every episode (thesis, 5.6)."""
 
-    def __init__(self, houses: Sequence[HousePlace], num_envs: int, *, models: tuple[str, ...],
+    def __init__(self, places: Sequence[Place], num_envs: int, *, models: tuple[str, ...],
                  objects: int, pictures: int, min_distance: float, seed: int):
         super().__init__()
-        self.houses, self.models, self.objects = houses, models, objects
+        self.places, self.models, self.objects = places, models, objects
         self.min_distance = min_distance + OBJECT_RADIUS
         self.pictures = pictures
-        for index, house in enumerate(houses):
+        for index, place in enumerate(places):
             self.ranges.append((len(self.views), len(models)))
             for model, name in enumerate(models):
                 for picture in range(pictures):
                     counter = (seed, -1 - index, model * 1000 + picture)
-                    self.views.append(_portrait(index, house, model, name, counter))
+                    self.views.append(_portrait(index, place, model, name, counter))
 
-    def pick(self, house, counter, mode, fixed=None) -> tuple[int, int]:
+    def pick(self, place, counter, mode, fixed=None) -> tuple[int, int]:
         """As `_Pool.pick`; every object has several pictures."""
-        first, count = self.ranges[house]
+        first, count = self.ranges[place]
         local = draw_goal(count, *counter)
         shown = draw_wrong_goal(count, local, *counter) if mode == WRONG else local
         seed, env, episode = counter
@@ -228,17 +238,17 @@ class ObjectGoal(_Pool):
         right = first + local * self.pictures
         return right, -1 if mode == BLANK else first + shown * self.pictures + picture
 
-    def begin(self, env, house, counter, tau, mode) -> Episode:
+    def begin(self, env, place, counter, tau, mode) -> Episode:
         """Draw the target, put it and other objects somewhere, draw the start."""
-        goal, shown = self.pick(house, counter, mode)
-        target = (goal - self.ranges[house][0]) // self.pictures
+        goal, shown = self.pick(place, counter, mode)
+        target = (goal - self.ranges[place][0]) // self.pictures
         others = [model for model in range(len(self.models)) if model != target]
         turn = draw_index(len(others), counter[0], Stream.OBJECT_KIND, *counter[1:]) if (
             others) else 0
         kinds = [target, *(others[turn:] + others[:turn])[:self.objects - 1]]
-        placed = place_objects(self.houses[house], kinds, counter)
-        field = self.houses[house].geodesic(placed[0].x, placed[0].y)
-        starts = Starts(self.houses[house], field, self.min_distance)
+        placed = place_objects(self.places[place].starts()[0], kinds, counter)
+        field = distance_to(self.places[place], placed[0].x, placed[0].y)
+        starts = Starts(self.places[place], field, self.min_distance)
         return Episode(goal, shown, starts.draw(tau, *counter), field, 0.0, placed)
 
     def judge(self, situation) -> Judgement:
@@ -253,33 +263,37 @@ class RoomGoal(_Pool):
     Args:
         must_see: also require the rule of House3D's code: at least 4.5 % of the picture shows the
             room's objects, two decisions in a row.
+        label_names: behind the labels that a robot sees; for `must_see` alone.
     """
 
-    def __init__(self, houses: Sequence[HousePlace], num_envs: int, *, must_see: bool,
-                 min_distance: float):
+    def __init__(self, places: Sequence[RoomPlace], num_envs: int, *, must_see: bool,
+                 min_distance: float, label_names: Sequence[str] = ()):
         super().__init__()
         self.must_see = must_see
         self.kinds: list[str] = []  # of each view
-        self.inside: list[tuple] = []  # per house, kind: rectangles of the rooms
+        self.classes: dict[str, list[int]] = {}  # of the objects that tell a room's type
+        self.inside: list[tuple] = []  # per place, kind: rectangles of the rooms
         self.fields: list[tuple[FloorDistance, Starts]] = []
         self.state = {'seen': np.zeros(num_envs, np.int64), 'goal': np.zeros(num_envs, np.int64)}
-        for index, house in enumerate(houses):
+        for index, place in enumerate(places):
             by_kind: dict[str, list] = {}
-            for room in house.rooms:
+            for room in place.rooms:
                 by_kind.setdefault(room.kind, []).append(room)
             rows = [(kind, rooms, goal) for kind, rooms in by_kind.items()
-                    for goal in house.goals if goal.room == rooms[0].name]
+                    for goal in place.goals if goal.room == rooms[0].name]
             self.ranges.append((len(self.views), len(rows)))
             for kind, rooms, goal in rows:
+                if must_see and kind not in self.classes:
+                    self.classes[kind] = room_classes(label_names, kind)
                 self.views.append(View(index, goal.pose, kind.replace('_', ' ')))
                 self.kinds.append(kind)
                 self.inside.append(tuple(room.rect for room in rooms))
-                field = FloorDistance.to_rectangles(house.floor, [room.rect for room in rooms])
-                self.fields.append((field, Starts(house, field, min_distance)))
+                field = FloorDistance.to_rectangles(place.floor, [room.rect for room in rooms])
+                self.fields.append((field, Starts(place, field, min_distance)))
 
-    def begin(self, env, house, counter, tau, mode) -> Episode:
+    def begin(self, env, place, counter, tau, mode) -> Episode:
         """Draw a room type and a start outside it."""
-        goal, shown = self.pick(house, counter, mode)
+        goal, shown = self.pick(place, counter, mode)
         self.state['seen'][env], self.state['goal'][env] = 0, goal
         field, starts = self.fields[goal]
         return Episode(goal, shown, starts.draw(tau, *counter), field, 0.0)
@@ -292,7 +306,8 @@ class RoomGoal(_Pool):
             x, y = situation.poses[n, :2]
             inside = any(r.x0 <= x <= r.x1 and r.y0 <= y <= r.y1 for r in self.inside[goal])
             if self.must_see:
-                sees = inside and shows_room(situation.labels[n:n + 1], self.kinds[goal])[0]
+                sees = inside and shows_room(situation.labels[n:n + 1],
+                                             self.classes[self.kinds[goal]])[0]
                 self.state['seen'][n] = self.state['seen'][n] + 1 if sees else 0
                 success[n] = self.state['seen'][n] >= VISIBLE_STEPS
             else:
@@ -305,19 +320,21 @@ class Collect(_Pool):
 
     APPLE, LEMON = 0, 1
 
-    def __init__(self, houses: Sequence[HousePlace], num_envs: int, *, objects: int):
+    def __init__(self, places: Sequence[Place], num_envs: int, *, models: tuple[str, ...],
+                 objects: int):
         super().__init__()
-        self.houses, self.objects = houses, objects
-        self.models = MODELS['collect']
-        self.ranges = [(0, 0)] * len(houses)
+        self.places, self.models, self.objects = places, models, objects
+        self.ranges = [(0, 0)] * len(places)
 
-    def begin(self, env, house, counter, tau, mode) -> Episode:
+    def begin(self, env, place, counter, tau, mode) -> Episode:
         """Scatter the fruit; half of it is sour."""
         kinds = [k % 2 for k in range(self.objects)]
-        placed = place_objects(self.houses[house], kinds, counter)
-        cells = self.houses[house].floor.centres()
-        cell = cells[draw_index(len(cells), counter[0], Stream.START_CELL, *counter[1:])]
-        yaw = (uniform(counter[0], Stream.START_YAW, *counter[1:]) * 2 - 1) * math.pi
+        cells, headings = self.places[place].starts()
+        placed = place_objects(cells, kinds, counter)
+        index = draw_index(len(cells), counter[0], Stream.START_CELL, *counter[1:])
+        cell = cells[index]
+        yaw = ((uniform(counter[0], Stream.START_YAW, *counter[1:]) * 2 - 1) * math.pi
+               if headings is None else headings[index])
         return Episode(-1, -1, np.array([*cell, float(yaw), 0.0]), None, 0.0, placed)
 
     def judge(self, situation) -> Judgement:
@@ -330,11 +347,16 @@ class Collect(_Pool):
         return Judgement(np.zeros(len(reward), bool), reward, touched)
 
 
-def place_objects(house: HousePlace, kinds: list[int], counter: tuple[int, int, int]
+def distance_to(place: Place, x: float, y: float) -> Distance:
+    """To a point: over the floor where the place knows the ways, else the straight line."""
+    goal = Goal((x, y, 0.0, 0.0), '')
+    return place.distance_to(goal) or StraightDistance(goal)
+
+
+def place_objects(cells: np.ndarray, kinds: list[int], counter: tuple[int, int, int]
                   ) -> tuple[Placed, ...]:
-    """Objects at free cells of a house, at least 0.8 m apart while there is room for it."""
+    """Objects at free cells [K,2] of a place, at least 0.8 m apart while there is room for it."""
     seed, env, episode = counter
-    cells = house.floor.centres()
     placed: list[Placed] = []
     for k, kind in enumerate(kinds):
         for attempt in range(20):
@@ -347,18 +369,18 @@ def place_objects(house: HousePlace, kinds: list[int], counter: tuple[int, int, 
     return tuple(placed)
 
 
-def _portrait(index: int, house: HousePlace, model: int, name: str, counter) -> View:
-    """A picture of an object from 1 to 2 m, at some free place of the house."""
-    cells = house.floor.centres()
+def _portrait(index: int, place: Place, model: int, name: str, counter) -> View:
+    """A picture of an object from 1 to 2 m, anywhere in a place."""
+    cells, _ = place.starts()
     seed, env, episode = counter
     for attempt in range(40):
-        (placed,) = place_objects(house, [model], (seed, env, episode * 64 + attempt))
+        (placed,) = place_objects(cells, [model], (seed, env, episode * 64 + attempt))
         gap = np.hypot(cells[:, 0] - placed.x, cells[:, 1] - placed.y)
         near = cells[(gap >= 1.0) & (gap <= 2.0)]
         if len(near) == 0:
             continue
         eye = near[draw_index(len(near), seed, Stream.OBJECT_PLACE, env, episode, 7000 + attempt)]
-        walk = house.geodesic(placed.x, placed.y).at(eye[None])[0]
+        walk = distance_to(place, placed.x, placed.y).at(eye[None])[0]
         if walk < 1.1 * math.hypot(eye[0] - placed.x, eye[1] - placed.y) + 0.05:  # in sight
             break
     yaw = math.atan2(placed.y - eye[1], placed.x - eye[0])

@@ -29,6 +29,7 @@ from vn_sim_bridge.floor.contacts import (
     TRANSLATION_NOISE,
 )
 from vn_sim_bridge.floor.floor_map import CELL
+from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.navigation.goal_distances import over_floor
@@ -561,7 +562,7 @@ class WarpNavigationEnv:
         if wp.get_device(device).is_cuda:
             wp.set_stream(wp.stream_from_torch(wp.device_to_torch(device)), device)
         self.world_version, self.action_names = WORLD_VERSION, self.robot.action_names
-        self.simulator_name = HOUSE
+        self.simulator_name, self.label_names = HOUSE, LABELS
         self.places = open_houses(scenes, config.goals_per_room, config.goal_seed)
         if self.robot.footprint_radius > min(h.footprint_radius for h in self.places):
             raise UserError('the robot fits into the floor map of the house',

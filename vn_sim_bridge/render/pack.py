@@ -55,16 +55,21 @@ def standard_lights(count: int, rooms: int) -> Lights:
                   np.full((count, rooms, 3), 0.5, np.float32))
 
 
-def pack_scenes(scenes: Sequence[Scene]) -> Pack:
+def pack_scenes(scenes: Sequence[Scene], label_type: np.dtype | type = np.uint8) -> Pack:
     """Concatenate the scenes' arrays; textures that several scenes share are kept once.
 
     Raises:
-        UserError: a polygon with too many corners, or more polygons than an index can count.
+        UserError: a polygon with too many corners, more polygons than an index can count, or a
+            class that the type of labels cannot count.
     """
     for scene in scenes:
         if int(np.diff(scene.face_start).max()) > MAX_CORNERS:
             raise UserError(f'a polygon has at most {MAX_CORNERS} corners',
                             int(np.diff(scene.face_start).max()), 'split it')
+    most = max((int(scene.face_label.max(initial=0)) for scene in scenes), default=0)
+    if most > np.iinfo(label_type).max:
+        raise UserError(f'class ids of a {np.dtype(label_type)} are at most '
+                        f'{np.iinfo(label_type).max}', most, 'draw with 16-bit labels')
     vertex_base = np.cumsum([0] + [len(s.vertices) for s in scenes])
     face_base = np.cumsum([0] + [len(s.face_label) for s in scenes])
     corner_base = np.cumsum([0] + [len(s.face_vertices) for s in scenes])
@@ -95,7 +100,7 @@ def pack_scenes(scenes: Sequence[Scene]) -> Pack:
         face_uv=join((s.face_uv for s in scenes), np.float32),
         face_texture=join(map(texture, scenes), np.int32),
         face_colour=join((s.face_colour for s in scenes), np.float32),
-        face_label=join((s.face_label for s in scenes), np.uint8),
+        face_label=join((s.face_label for s in scenes), label_type),
         face_instance=join((s.face_instance for s in scenes), np.uint16),
         face_light=join((s.face_light + (light_base[i], 0) for i, s in enumerate(scenes)),
                         np.int32),

@@ -85,6 +85,11 @@ class Randomisation:
         return any(getattr(self, field.name) != field.default
                    for field in dataclasses.fields(self) if field.name not in base)
 
+    def of_the_base(self) -> Randomisation:
+        """What it varies of the base alone: for simulators that draw no light."""
+        base = {name: getattr(self, name) for name in ('motion_scale', 'slip', 'late_picture')}
+        return Randomisation(**base)
+
     @property
     def pictures_per_goal(self) -> int:
         """Differently lit pictures kept of each goal."""

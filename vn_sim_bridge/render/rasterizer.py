@@ -48,14 +48,17 @@ class Rasterizer:
         scenes: the scenes; cameras refer to them by index.
         size: side of the square pictures [pixels].
         threads: Numba threads used by `render`.
+        label_type: of the class ids, uint8 or uint16.
     """
 
-    def __init__(self, scenes: Sequence[Scene], size: int, *, threads: int = 1):
+    def __init__(self, scenes: Sequence[Scene], size: int, *, threads: int = 1,
+                 label_type: np.dtype | type = np.uint8):
         if not 1 <= size <= MAX_SIZE:
             raise UserError(f'pictures have 1 to {MAX_SIZE} pixels a side', size, 'choose fewer')
         self.size = size
         self.threads = threads
-        self.pack = pack_scenes(scenes)
+        self.label_type = np.dtype(label_type)
+        self.pack = pack_scenes(scenes, self.label_type)
         self.rooms = 1 + int(self.pack.face_room.max())
         self.most_faces = max(len(scene.face_label) for scene in scenes)
         self.most_groups = max(len(scene.group_room) for scene in scenes)
@@ -74,13 +77,14 @@ class Rasterizer:
 
         Returns:
             rgb [N,3,S,S] uint8, depth [N,S,S] float32 m along the optical axis (0 where nothing
-            is seen), labels [N,S,S] uint8, instances [N,S,S] uint16 (object m: 65535 - m).
+            is seen), labels [N,S,S] of `label_type`, instances [N,S,S] uint16 (object m:
+            65535 - m).
         """
         count, size = len(cameras), self.size
         if out is None:
             out = (np.empty((count, 3, size, size), np.uint8),
                    np.empty((count, size, size), np.float32),
-                   np.empty((count, size, size), np.uint8),
+                   np.empty((count, size, size), self.label_type),
                    np.empty((count, size, size), np.uint16))
         # One type for every call: the kernels are compiled once, and a robot never waits for it.
         lights = Lights(*(np.ascontiguousarray(part, np.float32) for part in (
@@ -436,6 +440,8 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
     size = depth.shape[0]
     half = size * 0.5
     slots, slot_of, code_of, stamp_of, stamp, codes = work
+    bits = np.int32(8 * labels.itemsize)  # of a class; known when this is compiled
+    classes = np.int32((1 << bits) - 1)
     used = 0
     nothing = np.int32(len(code_of) - 1)  # the entry of pixels that show none
     code_of[nothing] = 0
@@ -483,7 +489,7 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
                     _prepare(pack, face, frames[which], focal, half, cube, lamps[room],
                              slots[used])
                     thing = np.int32(pack.face_instance[face]) if which == 0 else 65536 - which
-                    code_of[ident] = thing << 8 | np.int32(pack.face_label[face])
+                    code_of[ident] = np.int32(thing << bits) | np.int32(pack.face_label[face])
                     used += 1
                 s = slots[np.uint64(slot_of[ident])]
             u_offset, v_offset = s[3], s[7]
@@ -551,9 +557,9 @@ def _shade(pack, scene, frames, objects, object_room, cube, lamps, focal, most_f
         for column in range(np.uint64(size)):
             codes[column] = code_of[np.uint64(min(idents[column], nothing))]
         for column in range(np.uint64(size)):
-            label_row[column] = np.uint8(codes[column] & 255)
+            label_row[column] = codes[column] & classes
         for column in range(np.uint64(size)):
-            instance_row[column] = np.uint16(codes[column] >> 8)
+            instance_row[column] = np.uint16(codes[column] >> bits)
 
 
 @_exact

@@ -62,7 +62,7 @@ class Scene:
     face_uv: np.ndarray  # [F,2,4] float32: u = uv[0,:3] . p + uv[0,3] in texture tiles; v likewise
     face_texture: np.ndarray  # [F] int32 into textures
     face_colour: np.ndarray  # [F,3] float32 reflectance, multiplies the texel
-    face_label: np.ndarray  # [F] uint8 class
+    face_label: np.ndarray  # [F] class, uint8, or uint16 where one is above 255
     face_instance: np.ndarray  # [F] uint16
     face_light: np.ndarray  # [F,2] int32: first node in light, nodes a row
     face_light_map: np.ndarray  # [F,4] float32: column = u * m[0] + m[1], row = v * m[2] + m[3]
@@ -77,6 +77,20 @@ class Scene:
     def triangle_count(self) -> int:
         """Triangles that the polygons would make."""
         return int(np.sum(np.diff(self.face_start) - 2))
+
+
+def as_labels(classes) -> np.ndarray:
+    """Class ids [F] in the narrowest type that holds them.
+
+    Raises:
+        UserError: an id that 16 bits cannot hold.
+    """
+    classes = np.asarray(classes, np.int64)
+    most, least = classes.max(initial=0), classes.min(initial=0)
+    if least < 0 or most > 0xFFFF:
+        raise UserError('class ids lie between 0 and 65535', int(least if least < 0 else most),
+                        'number the classes from 0')
+    return classes.astype(np.uint8 if most <= 0xFF else np.uint16)
 
 
 class SceneBuilder:
@@ -198,7 +212,7 @@ class SceneBuilder:
             face_uv=np.array(self._uvs, np.float32),
             face_texture=np.array(self._textures, np.int32),
             face_colour=np.array(self._colours, np.float32),
-            face_label=np.array(self._labels, np.uint8),
+            face_label=as_labels(self._labels),
             face_instance=np.array(self._instances, np.uint16),
             face_light=face_light,
             face_light_map=light_map,

@@ -13,7 +13,7 @@ from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.floor.contacts import World
 from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.houses.labels import LABELS
-from vn_sim_bridge.houses.objects import object_scene
+from vn_sim_bridge.houses.objects import GOAL_OBJECTS, object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.splits import SPLITS
 from vn_sim_bridge.render.pack import Lights
@@ -85,6 +85,7 @@ class HouseSimulator(BaseSimulator):
     places: list[House]
     version = WORLD_VERSION
     label_names = LABELS
+    task_objects = {'object': GOAL_OBJECTS, 'collect': ('apple', 'lemon')}
     splits = {name: ScenesBySeed(seeds) for name, seeds in SPLITS.items()}
 
     @classmethod
