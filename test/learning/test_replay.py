@@ -1,114 +1,24 @@
 """The replay memory and the pictures' targets: stored values tell their environment and row."""
 
-import colorsys
-import hashlib
-import json
-import math
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
-from paths import ROOT
+from replay_stream import (
+    ENVS,
+    GOAL_CLASSES,
+    GOAL_TABLE,
+    LENGTHS,
+    SIZE,
+    Stream,
+    decode,
+    draws,
+    memory,
+)
 
 from vn_nav.errors import UserError
-from vn_nav.learning.pixel_change import (
-    average_pool_target,
-    label_colours,
-    label_target,
-    pixel_change,
-)
+from vn_nav.learning.pixel_change import label_colours, label_target, pixel_change
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.replay_rings import encode_depth
 from vn_nav.learning.returns import n_step_returns
-from vn_nav.learning.rollout import Rollout
-from vn_nav.observation import Observation
-
-SIZE, ENVS, GOALS = 6, 3, 5
-GOAL_TABLE = torch.arange(GOALS, dtype=torch.uint8)[:, None, None, None].expand(
-    GOALS, 3, SIZE, SIZE).contiguous()
-GOAL_CLASSES = (100 + torch.arange(GOALS, dtype=torch.uint8))[:, None, None].expand(
-    GOALS, SIZE, SIZE).contiguous()
-
-
-def draws(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-class Stream:
-    """Rows of environments whose episodes have given lengths, one after the other.
-
-    Row t of environment e shows a picture with the bytes of t and e; an episode of n decisions
-    takes n + 1 rows, the last of them no frame. Every third episode is cut off; the others earn
-    1 or -1 at their end.
-    """
-
-    def __init__(self, lengths, rows):
-        envs = len(lengths)
-        t = torch.arange(rows)[:, None].expand(rows, envs)
-        env = torch.arange(envs).expand(rows, envs)
-        self.starts, self.valid, self.terminated, self.truncated = (
-            torch.zeros(4, rows, envs, dtype=torch.bool))
-        self.begin, self.end = torch.zeros(2, rows, envs, dtype=torch.int64)
-        self.last_reward = torch.zeros(rows, envs)
-        self.goal_index, self.last_action = torch.zeros(2, rows, envs, dtype=torch.int64)
-        self.valid |= True
-        for e, cycle in enumerate(lengths):
-            row = number = 0
-            while row < rows:
-                n = cycle[number % len(cycle)]
-                last = row + n
-                episode = slice(row, last + 1)
-                self.starts[row, e] = True
-                self.begin[episode, e], self.end[episode, e] = row, last
-                self.goal_index[episode, e] = (number + e) % GOALS
-                self.last_action[episode, e] = (t[episode, e] - 1) % 4
-                self.last_action[row, e] = -1
-                if last < rows:
-                    self.valid[last, e] = False
-                if last - 1 < rows:
-                    ends = self.truncated if number % 3 == 2 else self.terminated
-                    ends[last - 1, e] = True
-                if last < rows and number % 3 != 2:
-                    self.last_reward[last, e] = 1.0 if number % 2 == 0 else -1.0
-                row, number = last + 1, number + 1
-        self.action = t % 4
-        self.reward = t + 1000.0 * env + 0.5  # shaped: tells nothing of the task's reward
-        code = torch.stack([t % 256, t // 256, env], dim=-1).to(torch.uint8)
-        self.image = code[:, :, None, None].expand(rows, envs, SIZE, SIZE, 3).permute(
-            0, 1, 4, 2, 3)
-        self.segmentation = ((7 * t + env) % 256).to(torch.uint8)[..., None, None].expand(
-            rows, envs, SIZE, SIZE)
-        self.depth = ((t % 50) / 5.0 + env / 10)[..., None, None].expand(rows, envs, SIZE, SIZE)
-
-    def rollout(self, first, steps):
-        now, seen = slice(first, first + steps), slice(first, first + steps + 1)
-        return Rollout(
-            Observation(self.image[seen], GOAL_TABLE, self.goal_index[seen],
-                        self.last_action[seen], self.last_reward[seen]),
-            self.starts[seen], self.action[now], self.reward[now], self.terminated[now],
-            self.truncated[now], self.valid[now], None,
-            {'depth': self.depth[seen], 'segmentation': self.segmentation[seen]})
-
-    def fill(self, replay, rows, steps=7, first=0):
-        """Extend a memory by rows first..first+rows-1; the remainder is a shorter rollout."""
-        for begin in range(first, first + rows, steps):
-            replay.extend(self.rollout(begin, min(steps, first + rows - begin)))
-        return replay
-
-
-def memory(capacity=60, **options):
-    return Replay(capacity, ENVS, SIZE, GOAL_TABLE, goal_segmentation=GOAL_CLASSES, **options)
-
-
-LENGTHS = ((13, 1, 4), (2, 30, 9), (45, 3))
-
-
-def decode(image):
-    """Row and environment [...] that a picture [...,3,S,S] tells."""
-    code = image[..., 0, 0].long()
-    return code[..., 0] + 256 * code[..., 1], code[..., 2]
 
 
 def test_ids_above_255_come_back_as_they_went_in(tmp_path):
@@ -324,116 +234,6 @@ def test_equal_generators_draw_equal_batches():
                            replay.windows(16, 20, draws(8)).reward)
 
 
-def same_draws(a, b):
-    one, other = a.windows(50, 6, draws()), b.windows(50, 6, draws())
-    assert torch.equal(one.observation.image, other.observation.image)
-    for name in ('reward', 'action', 'valid', 'terminated', 'truncated', 'starts'):
-        assert torch.equal(getattr(one, name), getattr(other, name))
-    for name, part in one.privileged.items():
-        assert torch.equal(part, other.privileged[name])
-
-
-@pytest.mark.parametrize('rows', [40, 130])
-def test_a_mapped_memory_survives_a_reopen(tmp_path, rows):
-    stream = Stream(LENGTHS, rows + 50)
-    replay = stream.fill(memory(directory=tmp_path), rows)
-    state = json.loads(json.dumps(replay.state_dict()))
-    expected = stream.fill(memory(), rows)
-    same_draws(replay, expected)
-    replay.flush()
-    del replay
-    again = memory(directory=tmp_path)
-    assert again.resumed is None and again.count == 0
-    again.load_state_dict(state)
-    assert again.resumed == 'mapped' and again.count == expected.count
-    same_draws(again, expected)
-    for part in (again, expected):
-        stream.fill(part, 30, first=rows)
-    same_draws(again, expected)
-
-
-def test_rows_written_after_the_checkpoint_are_not_trusted(tmp_path):
-    stream = Stream(((500,), (500,), (500,)), 260)
-    replay = stream.fill(memory(directory=tmp_path), 130)
-    state = replay.state_dict()
-    stream.fill(replay, 12, first=130)  # in the place of rows 70 to 81
-    again = memory(directory=tmp_path)
-    again.load_state_dict(state)
-    assert (again.total, again.count) == (130, 48)
-    row, _ = decode(again.windows(300, 20, draws()).observation.image)
-    assert int(row.min()) == 82 and int(row.max()) == 129
-    assert torch.equal(row - row[0], torch.arange(21)[:, None].expand(21, 300))
-
-
-KILLED = """
-import os, signal, sys
-sys.path[:0] = [sys.argv[2], sys.argv[2] + '/..']
-from test_replay import Stream, memory
-replay = memory(directory=sys.argv[1])
-stream = Stream(((500,), (500,), (500,)), 260)
-stream.fill(replay, 80)
-print(replay.state_dict()['identity'], flush=True)
-write = replay._write
-def die(name, rows):
-    if name == 'reward':
-        os.kill(os.getpid(), signal.SIGKILL)
-    write(name, rows)
-replay._write = die
-replay.extend(stream.rollout(80, 7))
-"""
-
-
-def test_a_process_killed_while_it_writes_leaves_a_usable_memory(tmp_path):
-    done = subprocess.run(
-        [sys.executable, '-c', KILLED, str(tmp_path), str(Path(__file__).parent)],
-        capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == -9, done.stderr
-    replay = memory(directory=tmp_path)
-    replay.load_state_dict({'total': 80, 'count': 60, 'identity': done.stdout.strip()})
-    assert replay.resumed == 'mapped' and replay.count == 53  # 7 rows were being overwritten
-    row, _ = decode(replay.windows(300, 20, draws()).observation.image)
-    assert int(row.min()) == 27 and int(row.max()) == 79
-
-
-def test_without_files_a_resumed_memory_is_refilled(tmp_path):
-    stream = Stream(LENGTHS, 60)
-    state = stream.fill(memory(directory=tmp_path / 'lost'), 30).state_dict()
-    for replay in (memory(), memory(directory=tmp_path / 'new')):
-        stream.fill(replay, 20)
-        replay.load_state_dict(memory().state_dict())
-        assert replay.resumed == 'refilled' and replay.count == replay.steps == 0
-    replay = memory(directory=tmp_path / 'fresh')
-    replay.load_state_dict(state)
-    assert replay.resumed == 'refilled' and replay.count == 0
-    same_draws(stream.fill(replay, 50, steps=50), stream.fill(memory(), 50, steps=50))
-
-
-def test_files_of_another_memory_are_refused(tmp_path):
-    stream = Stream(LENGTHS, 60)
-    state = stream.fill(memory(directory=tmp_path), 30).state_dict()
-    for other in ({'capacity': 50}, {'privileged': ('depth',)}, {'max_depth': 5.0}):
-        with pytest.raises(UserError, match='remove that folder'):
-            memory(directory=tmp_path, **other)
-    with pytest.raises(UserError, match='goals differ'):
-        Replay(60, ENVS, SIZE, GOAL_TABLE + 1, directory=tmp_path)
-    # A new training in that folder: the checkpoint of the old one no longer fits.
-    stream.fill(memory(directory=tmp_path), 10)
-    with pytest.raises(UserError, match='its own replay files'):
-        memory(directory=tmp_path).load_state_dict(state)
-    with (tmp_path / 'image.ring').open('r+b') as file:
-        file.truncate(100)
-    with pytest.raises(UserError, match='image differ'):
-        memory(directory=tmp_path)
-    (tmp_path / 'replay.json').write_text('[]')
-    with pytest.raises(UserError, match='remove that folder'):
-        memory(directory=tmp_path)
-
-
-def test_a_full_disk_is_one_clear_error(tmp_path):
-    with pytest.raises(UserError, match='GB on the disk'):
-        Replay(10**9, 16, 174, None, directory=tmp_path)
-
-
 def test_rollouts_that_do_not_fit_are_refused():
     stream = Stream(LENGTHS, 90)
     with pytest.raises(UserError, match='extend it first'):
@@ -462,91 +262,3 @@ def test_depth_is_stored_in_steps_of_a_255th():
     depth = torch.tensor([0.0, 10.0, 5.0, 30.0, float('inf'), float('nan')])
     assert encode_depth(depth).tolist() == [0, 255, 128, 255, 255, 255]
     assert encode_depth(torch.tensor([7], dtype=torch.uint8)).tolist() == [7]
-
-
-@pytest.mark.parametrize('grey', [True, False])
-def test_pixel_change_equals_a_naive_loop(grey):
-    images = torch.randint(0, 256, (3, 2, 3, 11, 11), generator=draws(), dtype=torch.uint8)
-    change = pixel_change(images, cell=2, cells=4, grey=grey)  # a crop of 8: rows 1 to 8
-    assert change.shape == (2, 2, 4, 4) and change.dtype == torch.float32
-    for t in range(2):
-        for b in range(2):
-            for y in range(4):
-                for x in range(4):
-                    total = 0.0
-                    for i in range(1 + 2 * y, 3 + 2 * y):
-                        for j in range(1 + 2 * x, 3 + 2 * x):
-                            now, then = (images[t + k, b, :, i, j].tolist() for k in (1, 0))
-                            difference = [p - q for p, q in zip(now, then, strict=True)]
-                            if grey:
-                                luma = (0.299, 0.587, 0.114)
-                                total += abs(sum(w * d for w, d in
-                                                 zip(luma, difference, strict=True)))
-                            else:
-                                total += sum(map(abs, difference)) / 3
-                    assert float(change[t, b, y, x]) == pytest.approx(total / 4 / 255, abs=1e-6)
-
-
-@pytest.mark.parametrize(('size', 'cells'), [(84, 20), (172, 42), (174, 42)])
-def test_targets_have_the_sizes_of_the_thesis(size, cells):
-    images = torch.zeros(2, 1, 3, size, size, dtype=torch.uint8)
-    images[1] = 255
-    change = pixel_change(images)
-    assert change.shape == (1, 1, cells, cells) and bool((change > 0.999).all())
-    depth = torch.arange(size, dtype=torch.float32).expand(1, 1, size, size)
-    target = average_pool_target(depth, cells)
-    margin = (size - 4 * cells) // 2
-    assert target.shape == (1, 1, cells, cells)
-    assert target[0, 0, 0].tolist() == [margin + 4 * k + 1.5 for k in range(cells)]
-    with pytest.raises(UserError, match='fit into the picture'):
-        average_pool_target(depth, cells + 2)
-
-
-@pytest.mark.parametrize('count', [1, 2, 5, 12, 57])
-def test_colours_lie_farther_apart_than_by_chance_or_on_a_wheel_of_hues(count):
-    def gap(rgb):
-        """Least distance in the HSB cone, from RGB by another road than the code's."""
-        points = []
-        for colour in rgb.tolist():
-            hue, saturation, brightness = colorsys.rgb_to_hsv(*colour)
-            angle = torch.tensor(hue * 2 * torch.pi)
-            points.append([float(angle.cos()) * saturation * brightness,
-                           float(angle.sin()) * saturation * brightness, brightness])
-        return float(torch.pdist(torch.tensor(points)).min())
-    colours = label_colours(count)
-    assert colours.shape == (count, 3) and colours.dtype == torch.float32
-    assert 0 <= float(colours.min()) and float(colours.max()) <= 1
-    assert not colours[0].any() and torch.equal(colours, label_colours(count))
-    if count > 1:
-        black = torch.zeros(1, 3)
-        hues = [colorsys.hsv_to_rgb(k / (count - 1), 1.0, 1.0) for k in range(count - 1)]
-        others = [torch.rand(count - 1, 3, generator=draws(seed)) for seed in range(50)]
-        for other in (torch.tensor(hues), *others):
-            assert gap(colours) > gap(torch.cat([black, other])) - 1e-6
-    with pytest.raises(UserError, match='1 to 65536 classes'):
-        label_colours(65_537)
-
-
-def test_the_colours_of_published_weights_are_as_they_were():
-    """Of up to 64 classes, whatever more classes take."""
-    digests = {5: 'c3dca6a10fc89f47', 57: 'adf4c80da5958f0c', 64: 'f528bdb54742cb04'}
-    assert {count: hashlib.sha256(label_colours(count).numpy().tobytes()).hexdigest()[:16]
-            for count in digests} == digests
-
-
-@pytest.mark.parametrize('count', [65, 100, 190, 256, 257, 700, 1500])
-def test_many_colours_are_as_far_apart_as_balls_can_be_packed(count):
-    """The volume of the cone over their number says how far apart they can be inside it."""
-    colours = label_colours(count)
-    points = []
-    for colour in colours.tolist():
-        hue, saturation, brightness = colorsys.rgb_to_hsv(*colour)
-        turn, chroma = 2 * math.pi * hue, saturation * brightness
-        points.append([chroma * math.cos(turn), chroma * math.sin(turn), brightness])
-    gap = float(torch.pdist(torch.tensor(points, dtype=torch.float64)).min())
-    densest = (math.sqrt(2) * (math.pi / 3) / count) ** (1 / 3)
-    assert gap > 0.95 * densest and not colours[0].any()
-    assert 0 <= float(colours.min()) and float(colours.max()) <= 1
-    assert torch.equal(colours, label_colours(count))
-    # They are 8-bit pictures of this many colours, too.
-    assert len({tuple(row) for row in (colours * 255).round().int().tolist()}) == count

@@ -18,169 +18,23 @@ from geometry_msgs.msg import Twist
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from ros_harness import wait_until, write_checkpoint
-from rosbags.typesys import Stores, get_typestore
-from small_bags import FIXTURE, IMAGE, ODOMETRY, START, drive, make, odometry, write
+from shadow_drives import BASE, FOREIGN, NAMES, ROBOT, STORE, two_drives
+from small_bags import FIXTURE, ODOMETRY, START, drive, odometry, write
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.bags.segmenter import NO_ACTION
-from vn_nav.bags.shadow.compare import (
-    Answer,
-    Shadow,
-    as_json,
-    compare,
-    figures,
-    markdown,
-    read_shadow,
-)
-from vn_nav.bags.shadow.plan import make_plan, stamped
+from vn_nav.bags.shadow.compare import read_shadow
+from vn_nav.bags.shadow.plan import make_plan
 from vn_nav.bags.storage.reader import read_bag
 from vn_nav.bags.storage.stream import messages
 from vn_nav.cli import main
 from vn_nav.errors import UserError
 from vn_nav.nodes import shadow_domain
 from vn_nav.policy.runtime import PolicyRuntime
-from vn_nav.robot import DRIVE_ACTIONS, RobotSpec, load_robot
-
-ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
-BASE = FIXTURE.parent.parent / 'config' / 'robots' / 'demo_base.yaml'
-FOREIGN = FIXTURE.parent / 'foreign_robot'
-NAMES = ('image: /camera/color/image_raw\nodometry: /odometry/filtered\n'
-         'command: /base/cmd_vel\n')
-END = 'std_msgs/msg/UInt8'
-STORE = get_typestore(Stores.ROS2_JAZZY)
-
-
-# How two differ.
-
-def shadow_of(choices, speed=0.0, episodes=None, done='forward'):
-    """Answers a second apart, and a command at each."""
-    episodes = episodes or [0] * len(choices)
-    answers = [Answer(START + k * 10**9, episode, choice, done) for k, (choice, episode)
-               in enumerate(zip(choices, episodes, strict=True)) if choice]
-    return Shadow(answers, {a.time: np.array([speed, 0.0, -2 * speed, 0.0]) for a in answers})
-
-
-def test_how_two_policies_differ_is_counted():
-    a = shadow_of(['forward', 'forward', 'forward', 'arrived', 'arrived', 'forward', 'forward'],
-                  0.1, [0, 0, 0, 0, 1, 1, 1])
-    b = shadow_of(['forward', 'backward', 'backward', 'forward', 'backward', 'forward', None],
-                  0.3, [0, 0, 0, 0, 1, 1, 1])
-    b.commands[START + 1] = np.zeros(4)  # one that a did not give
-    found = compare(a, b, ('old', 'new'), ([0.01, 0.03], [0.02]))
-    assert found.decisions == 6 and found.alone == {'a': 1, 'b': 0}
-    assert found.agree == pytest.approx(2 / 6)
-    assert found.confusion == {'arrived': {'forward': 1, 'backward': 1},
-                               'forward': {'forward': 2, 'backward': 2}}
-    assert found.arrived == {'a': [3.0, 4.0], 'b': [], 'both': []}
-    assert found.commands == 6
-    assert found.mean_dv == pytest.approx(0.2) and found.mean_dw == pytest.approx(0.4)
-    assert found.drive == {'a': pytest.approx(5 / 7), 'b': pytest.approx(3 / 6)}
-    # An episode's end ends what is in a row.
-    assert found.disagreements == 2
-    assert found.first == found.longest[0]
-    assert dataclasses.astuple(found.first) == (0, 1.0, 3.0, 3, 'forward', 'backward')
-    assert dataclasses.astuple(found.longest[1]) == (1, 4.0, 4.0, 1, 'arrived', 'backward')
-    assert found.latency['a'] == {'median': 0.02, 'p95': pytest.approx(0.029)}
-    assert json.loads(as_json(found))['confusion'] == found.confusion
-    rows = dict(figures(found))
-    assert rows['of them the same'] == '33.3%' and rows['arrived'] == 'old 2, new 0, both 0'
-    assert '1.00 to 3.00 s (episode 0)' in rows['the first']
-    assert 'action filter' not in rows
-    a.filtered = {'decisions': 6, 'acted': 4, 'changed': 1}
-    found = compare(a, b, ('old', 'new'), ([], []))
-    assert json.loads(as_json(found))['filtered'] == {'a': a.filtered, 'b': None}
-    assert dict(figures(found))['action filter'] == (
-        'old acted at 4 of 6 decisions, changed 1; new none')
-    text = markdown(found)
-    assert '| forward | 2 | 2 |' in text and r'mean \|dv\|' in text
-
-
-def test_drives_with_nothing_in_common_are_refused(tmp_path):
-    a = shadow_of(['forward'])
-    b = Shadow([a.answers[0]._replace(time=1)], {})
-    with pytest.raises(UserError, match='in common'):
-        compare(a, b, ('a', 'b'), ([], []))
-    with pytest.raises(UserError, match='vn_nav bag drive'):
-        read_shadow(FIXTURE)
-    same = compare(a, a, ('a', 'b'), ([], []))
-    assert same.agree == 1.0 and same.first is None and same.longest == []
-
-
-# What is shown.
-
-def test_a_decision_is_wanted_where_training_takes_a_picture(tmp_path):
-    drives = load_drives(FIXTURE, Wanted(ROBOT), tmp_path)
-    plan = make_plan(FIXTURE, ROBOT, Topics())
-    names = [None if a == NO_ACTION else DRIVE_ACTIONS[a] for a in drives.action]
-    assert [d.done for d in plan.decisions] == [None, *names[:-1]]
-    assert [d.last for d in plan.decisions] == [False] * (len(names) - 1) + [True]
-    assert plan.goals.shown == 1 and plan.rate == 20.0 and plan.camera_info is not None
-    events = [event for event in plan.events() if event is not None]
-    shown = [event for event in events if event.decision is not None]
-    assert [event.decision for event in shown] == plan.decisions
-    # By the clock of the headers, which the simulator drives faster than the wall's.
-    assert [event.stamp * 1e-9 for event in shown] == pytest.approx(list(drives.time), abs=1e-6)
-    ticks = [event.stamp for event in events if not event.picture]
-    assert len(ticks) > 50
-    assert np.diff(ticks) == pytest.approx(50e6, abs=1e3)
-    assert [event.log_time for event in events] == sorted(event.log_time for event in events)
-
-
-def test_another_robot_with_compressed_pictures_and_no_goal(tmp_path):
-    (tmp_path / 'topics.yaml').write_text(NAMES)
-    plan = make_plan(FOREIGN, ROBOT, load_topics(tmp_path / 'topics.yaml'))
-    assert plan.compressed and plan.goals.hindsight == 1 and plan.goals.shown == 0
-    *_, last = [e for e in plan.events() if e is not None and e.decision is not None]
-    message = STORE.deserialize_cdr(last.data, 'sensor_msgs/msg/CompressedImage')
-    assert np.array_equal(plan.goals.picture(0), decode_rgb(message))
-    grey = np.full((8, 8, 3), 128, np.uint8)
-    given = make_plan(FOREIGN, ROBOT, load_topics(tmp_path / 'topics.yaml'), grey)
-    assert given.goals.picture(0) is grey and given.goals.hindsight == 0
-
-
-def two_drives():
-    """Two episodes, the second by a clock that was set back."""
-    one = drive(4.0)
-    one.append(('/episode_end', END, START + 5 * 10**9, make(END, data=1)))
-    two = []
-    for name, kind, log_time, message in drive(4.0, seed=1):
-        if hasattr(message, 'header'):
-            message.header.stamp.sec -= 1000
-        two.append((name, kind, log_time + 10 * 10**9, message))
-    return one + two
-
-
-def test_a_clock_that_goes_back_goes_on_for_the_node(tmp_path):
-    plan = make_plan(write(tmp_path / 'bag.mcap', two_drives()), ROBOT, Topics())
-    assert {d.episode for d in plan.decisions} == {0, 1}
-    for picture_or_tick in (True, False):
-        stamps = [e.stamp for e in plan.events() if e and e.picture == picture_or_tick]
-        assert (np.diff(stamps) > 0).all() and len(stamps) > 50
-        assert stamps[-1] - stamps[0] < 20e9
-
-
-def test_unreadable_pictures_are_left_out_and_counted(tmp_path):
-    messages = drive(4.0)
-    broken = []
-    for name, kind, log_time, message in messages:
-        if kind == IMAGE and (log_time - START) // 10**8 in (17, 18, 19):
-            message.encoding = 'no such'
-        broken.append((name, kind, log_time, message))
-    whole = make_plan(write(tmp_path / 'whole.mcap', drive(4.0)), ROBOT, Topics())
-    plan = make_plan(write(tmp_path / 'bag.mcap', broken), ROBOT, Topics())
-    shown = [e.decision for e in plan.events() if e and e.decision]
-    for _ in range(2):  # each policy of a comparison reads the bag
-        list(plan.events())
-        assert plan.unreadable == 3
-    wanted = [d.time for d in plan.decisions]
-    left_out = set(wanted) - {d.time for d in shown}
-    assert len(left_out) <= 1 and wanted == [d.time for d in whole.decisions]
-    for before, after in zip(plan.decisions, plan.decisions[1:], strict=False):
-        if before.time in left_out:  # nobody can have told it what was done since the last one
-            assert next(d for d in shown if d.time == after.time).done is None
+from vn_nav.robot import DRIVE_ACTIONS, load_robot
 
 
 def test_what_cannot_be_driven_is_one_line(tmp_path, capsys):
@@ -216,15 +70,6 @@ def test_what_cannot_be_driven_is_one_line(tmp_path, capsys):
         assert expected in error
     assert not (tmp_path / 'out').exists()
 
-
-def test_a_stamp_is_replaced_in_place():
-    message = STORE.serialize_cdr(odometry(START, 1.5), ODOMETRY)
-    back = STORE.deserialize_cdr(stamped(bytes(message), 7_000_000_008), ODOMETRY)
-    assert (back.header.stamp.sec, back.header.stamp.nanosec) == (7, 8)
-    assert back.pose.pose.position.x == 1.5 and back.header.frame_id == 'base_link'
-
-
-# The real node.
 
 @pytest.fixture
 def stranger():

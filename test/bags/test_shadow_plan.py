@@ -1,0 +1,82 @@
+"""What a policy is shown of a recorded drive, and when."""
+
+
+import numpy as np
+import pytest
+from shadow_drives import FOREIGN, NAMES, ROBOT, STORE, two_drives
+from small_bags import FIXTURE, IMAGE, ODOMETRY, START, drive, odometry, write
+
+from vn_msgs_py.images import decode_rgb
+from vn_nav.bags.dataset import Wanted
+from vn_nav.bags.drive_cache import load_drives
+from vn_nav.bags.roles import Topics, load_topics
+from vn_nav.bags.segmenter import NO_ACTION
+from vn_nav.bags.shadow.plan import make_plan, stamped
+from vn_nav.robot import DRIVE_ACTIONS
+
+
+def test_a_decision_is_wanted_where_training_takes_a_picture(tmp_path):
+    drives = load_drives(FIXTURE, Wanted(ROBOT), tmp_path)
+    plan = make_plan(FIXTURE, ROBOT, Topics())
+    names = [None if a == NO_ACTION else DRIVE_ACTIONS[a] for a in drives.action]
+    assert [d.done for d in plan.decisions] == [None, *names[:-1]]
+    assert [d.last for d in plan.decisions] == [False] * (len(names) - 1) + [True]
+    assert plan.goals.shown == 1 and plan.rate == 20.0 and plan.camera_info is not None
+    events = [event for event in plan.events() if event is not None]
+    shown = [event for event in events if event.decision is not None]
+    assert [event.decision for event in shown] == plan.decisions
+    # By the clock of the headers, which the simulator drives faster than the wall's.
+    assert [event.stamp * 1e-9 for event in shown] == pytest.approx(list(drives.time), abs=1e-6)
+    ticks = [event.stamp for event in events if not event.picture]
+    assert len(ticks) > 50
+    assert np.diff(ticks) == pytest.approx(50e6, abs=1e3)
+    assert [event.log_time for event in events] == sorted(event.log_time for event in events)
+
+
+def test_another_robot_with_compressed_pictures_and_no_goal(tmp_path):
+    (tmp_path / 'topics.yaml').write_text(NAMES)
+    plan = make_plan(FOREIGN, ROBOT, load_topics(tmp_path / 'topics.yaml'))
+    assert plan.compressed and plan.goals.hindsight == 1 and plan.goals.shown == 0
+    *_, last = [e for e in plan.events() if e is not None and e.decision is not None]
+    message = STORE.deserialize_cdr(last.data, 'sensor_msgs/msg/CompressedImage')
+    assert np.array_equal(plan.goals.picture(0), decode_rgb(message))
+    grey = np.full((8, 8, 3), 128, np.uint8)
+    given = make_plan(FOREIGN, ROBOT, load_topics(tmp_path / 'topics.yaml'), grey)
+    assert given.goals.picture(0) is grey and given.goals.hindsight == 0
+
+
+def test_a_clock_that_goes_back_goes_on_for_the_node(tmp_path):
+    plan = make_plan(write(tmp_path / 'bag.mcap', two_drives()), ROBOT, Topics())
+    assert {d.episode for d in plan.decisions} == {0, 1}
+    for picture_or_tick in (True, False):
+        stamps = [e.stamp for e in plan.events() if e and e.picture == picture_or_tick]
+        assert (np.diff(stamps) > 0).all() and len(stamps) > 50
+        assert stamps[-1] - stamps[0] < 20e9
+
+
+def test_unreadable_pictures_are_left_out_and_counted(tmp_path):
+    messages = drive(4.0)
+    broken = []
+    for name, kind, log_time, message in messages:
+        if kind == IMAGE and (log_time - START) // 10**8 in (17, 18, 19):
+            message.encoding = 'no such'
+        broken.append((name, kind, log_time, message))
+    whole = make_plan(write(tmp_path / 'whole.mcap', drive(4.0)), ROBOT, Topics())
+    plan = make_plan(write(tmp_path / 'bag.mcap', broken), ROBOT, Topics())
+    shown = [e.decision for e in plan.events() if e and e.decision]
+    for _ in range(2):  # each policy of a comparison reads the bag
+        list(plan.events())
+        assert plan.unreadable == 3
+    wanted = [d.time for d in plan.decisions]
+    left_out = set(wanted) - {d.time for d in shown}
+    assert len(left_out) <= 1 and wanted == [d.time for d in whole.decisions]
+    for before, after in zip(plan.decisions, plan.decisions[1:], strict=False):
+        if before.time in left_out:  # what was done since the last one is unknown
+            assert next(d for d in shown if d.time == after.time).done is None
+
+
+def test_a_stamp_is_replaced_in_place():
+    message = STORE.serialize_cdr(odometry(START, 1.5), ODOMETRY)
+    back = STORE.deserialize_cdr(stamped(bytes(message), 7_000_000_008), ODOMETRY)
+    assert (back.header.stamp.sec, back.header.stamp.nanosec) == (7, 8)
+    assert back.pose.pose.position.x == 1.5 and back.header.frame_id == 'base_link'
