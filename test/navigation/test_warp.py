@@ -127,7 +127,7 @@ def test_observations_share_the_devices_memory():
 
 
 @pytest.mark.parametrize('module', ['vn_sim_bridge.render.warp_renderer',
-                                    'vn_sim_bridge.navigation.warp_env'])
+                                    'vn_sim_bridge.navigation.warp_decisions'])
 def test_the_kernels_compile_for_a_gpu(tmp_path, module):
     code = (f'import importlib, warp as wp\nm = importlib.import_module({module!r})\n'
             f'print(wp.compile_aot_module(m, arch=90, module_dir={str(tmp_path)!r}))')
