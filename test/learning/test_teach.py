@@ -184,7 +184,7 @@ def test_a_signal_ends_a_stage_between_two_steps_and_a_second_one_at_once(capsys
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(('sign', 'kept'), [
-    ('learning the place', 'not measured'), ('learning the ways', 'not measured'),
+    ('learning the place', 'not measured'), ('learning paths', 'not measured'),
     ('arrival · right goal', 'of 20 rows')])
 def test_after_sigint_there_is_a_whole_checkpoint_and_the_rows_so_far(sign, kept, bag, tmp_path):
     out = tmp_path / 'out'
