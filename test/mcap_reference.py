@@ -1,6 +1,5 @@
 """Messages of an MCAP file as the reference reader and ours have them."""
 
-
 from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 

@@ -1,6 +1,5 @@
 """Messages that do not compress, and what a recording holds that may have no end."""
 
-
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.records import Message

@@ -1,6 +1,5 @@
 """Rows of environments whose episodes have given lengths, for a replay memory."""
 
-
 import torch
 
 from vn_nav.learning.replay import Replay

@@ -13,83 +13,24 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from joystick_drive import ROBOT, SIZE, drive, write_bag
 from paths import ROOT
-from ros_harness import write_checkpoint
-from small_bags import (
-    IMAGE,
-    INFO,
-    ODOMETRY,
-    START,
-    STRING,
-    camera_info,
-    make,
-    odometry,
-    picture,
-    serialised,
-)
 
-from vn_msgs_py.topics import topic
 from vn_nav.bags.mapping.pose_graph import between, compose
-from vn_nav.bags.storage.writer import BagWriter
 from vn_nav.cli import main
 from vn_nav.errors import UserError
-from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.presets import preset
 from vn_nav.learning.stages import Stages
-from vn_nav.learning.teach_evaluation import BEFORE, MIN_EPISODES, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.learning.teach_evaluation import RIGHT
 from vn_nav.learning.teach_job import TeachJob
 from vn_nav.learning.teach_network import OWN_LOGIT_SHARE
 from vn_nav.learning.teaching import teach
 from vn_nav.learning.trainer import train
-from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
-from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.policy.checkpoint import load_checkpoint
 from vn_sim_bridge import teach_place as place
-from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.recorded.image_graph import build_graph
-from vn_sim_bridge.robot.joystick import Joystick
-from vn_sim_bridge.robot.simulated_robot import TICK
-from vn_sim_bridge.simulators.house import WORLD_VERSION, HouseSimulator
+from vn_sim_bridge.simulators.house import WORLD_VERSION
 from vn_sim_bridge.teach_place import draw_map, held_out, make_env, make_pairs
-
-ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
-SIZE = 36
-EVERY = 4  # ticks between two pictures
-
-
-def drive(seconds, rooms=1, house=7, size=SIZE):
-    """Poses [N,3] and pictures of somebody with a joystick in a small house."""
-    built = generate_house(house, rooms=rooms)
-    simulator = HouseSimulator([built], [0], robot=ROBOT, size=size)
-    cells = built.floor.centres()
-    start = cells[np.argmin(np.hypot(*(cells - built.goals[0].pose[:2]).T))]
-    simulator.place(np.array([0]), np.array([[*start, 0.0, 0.0]]))
-    person, poses, pictures = Joystick(built, *start), [], []
-    for tick in range(int(seconds / TICK)):
-        simulator.move(person.velocity(simulator.poses[0])[None] * TICK)
-        if tick % EVERY == 0:
-            poses.append(simulator.poses[0, :3].copy())
-            pictures.append(simulator.observe().rgb[0].copy())
-    return np.array(poses), np.array(pictures)
-
-
-def write_bag(folder, poses, pictures):
-    """The drive as a recorder leaves it: pictures, odometry, calibration, and a world version."""
-    size = pictures.shape[-1]
-    with BagWriter(folder, [topic(n) for n in ('image_raw', 'odom', 'camera_info', 'scene')]) as (
-            writer):
-        def write(name, kind, time, message):
-            writer.write(name, serialised(kind, message), time)
-        write('scene', STRING, START, make(STRING, data=json.dumps(
-            {'world_version': WORLD_VERSION})))
-        for k, (x, y, yaw) in enumerate(poses):
-            time = START + round(k * EVERY * TICK * 1e9)
-            told = odometry(time, x, yaw)
-            told.pose.pose.position.y = float(y)
-            write('odom', ODOMETRY, time, told)
-            write('camera_info', INFO, time, camera_info(time, size / 2, size))
-            write('image_raw', IMAGE, time, picture(time, np.ascontiguousarray(
-                pictures[k].transpose(1, 2, 0))))
-    return folder
 
 
 @pytest.fixture(scope='module')
@@ -178,56 +119,6 @@ def bag(driven, tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('driven') / 'bag', *driven)
 
 
-@pytest.mark.slow
-def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, capsys):
-    model = write_checkpoint(tmp_path / 'model', size=SIZE, arrival=0.1, stop_threshold=0.5)
-    figures, page = tmp_path / 'figures.json', tmp_path / 'page.html'
-    words = ['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
-             '--goals', '24', '--episodes', '8', '--max-decisions', '40', '--json', str(figures)]
-    assert main([*words, '--html', str(page)]) == 0
-    assert 'all goals of bag' in capsys.readouterr().out
-    result = json.loads(figures.read_text())
-    assert result['bag'] == 'bag' and list(result['splits']) == ['all_goals']
-    rows = result['splits']['all_goals']['rows']
-    assert list(rows) == ['arrival', 'declared']
-    assert all(row['episodes'] == 8 for own in rows.values() for row in own.values())
-    success = {name: row['success'] for name, row in rows['arrival'].items()}
-    assert success['shortest path'] > 0.8 > success['random actions']
-    shown = page.read_text()
-    assert shown.count('<svg') == 6 and 'House' not in shown and 'drive bag' in shown
-    # As `vn_nav teach` divides them: other goals, so other starts.
-    assert main([*words, '--split', 'seen_goals', '--split', 'unseen_goals', '--no-controls']) == 0
-    splits = json.loads(figures.read_text())['splits']
-    assert list(splits) == ['seen_goals', 'unseen_goals']
-    own, others = (split['rows']['arrival']['right goal, sample']['start_distance']
-                   for split in splits.values())
-    assert own != others
-
-
-@pytest.mark.slow
-def test_a_drive_is_a_scene_by_its_name(bag, tmp_path):
-    model, figures = write_checkpoint(tmp_path / 'model', size=SIZE), tmp_path / 'figures.json'
-    assert main(['evaluate', str(model), '--scene', f'bag:{bag}', '--episodes', '4',
-                 '--max-decisions', '5', '--no-controls', '--json', str(figures)]) == 0
-    assert list(json.loads(figures.read_text())['splits']['scenes']['scenes']) == [f'bag:{bag}']
-    assert main(['evaluate', str(model), '--scene', 'bag:/nowhere', '--episodes', '4']) == 2
-
-
-@pytest.mark.parametrize(('known', 'code', 'says'), [
-    ({'world_version': '0'}, 2, 'world version'), ({'world_version': 'recorded'}, 0, ''),
-    ({'task': 'room'}, 2, 'knows rooms'), ({'camera_fov_deg': 60.0}, 2, 'the camera')])
-def test_what_a_checkpoint_needs_to_be_measured_in_a_drive(known, code, says, bag, tmp_path,
-                                                           capsys):
-    model = write_checkpoint(tmp_path / 'model', size=SIZE)
-    config = json.loads((model / CONFIG).read_text()) | known
-    del config['config_sha256']  # changed on purpose
-    (model / CONFIG).write_text(json.dumps(config))
-    assert main(['evaluate', str(model), '--bag', str(bag), '--cache', str(bag.parent / 'decoded'),
-                 '--goals', '8', '--episodes', '1', '--max-decisions', '2', '--no-controls',
-                 '--no-straighten']) == code
-    assert says in capsys.readouterr().err
-
-
 def test_the_robot_needs_the_actions_of_the_checkpoint(driven, tmp_path, capsys):
     bag = write_bag(tmp_path / 'bag', *(part[:5] for part in driven))
     (tmp_path / 'robot.yaml').write_text(
@@ -276,31 +167,6 @@ def test_two_houses_are_no_one_place(joint, houses, tmp_path, capsys):
                      2 if joint == 'odometry starts again' else 0)
 
 
-def test_rows_and_episodes_are_as_many_as_there_is_time_for():
-    network, before = (load_checkpoint('models/anywhere').network for _ in range(2))
-    rows = rows_of(['seen_goals', 'unseen_goals'], network, before)
-    assert rows[0] == Row('seen_goals', 'arrival', RIGHT) and len(rows) == 20
-    assert not any(row.name == BEFORE for row in rows_of(['seen_goals'], network, None))
-    # A thousandth of a second a robot.
-    costs = [Cost(MIN_EPISODES, 0.01, 0.01), Cost(50, 0.055, 0.01)]
-
-    def needed(some, envs):
-        return sum(300 * (0.01 + (row.name not in (SHORTEST, 'random actions'))
-                          * (0.005 + 0.001 * envs)) for row in some)
-    whole = plan(rows, costs, 50, math.inf, 300)
-    assert whole.episodes == 50 and whole.rows == rows and not whole.missing
-    assert math.isclose(whole.seconds, needed(rows, 50))
-    some = plan(rows, costs, 50, needed(rows, 20) + 0.01, 300)
-    assert some.episodes == 20 and some.rows == rows
-    few = plan(rows, costs, 50, needed(rows[:7], MIN_EPISODES) + 0.01, 300)
-    assert few.episodes == MIN_EPISODES and few.rows == rows[:7] and few.missing == rows[7:]
-    none = plan(rows, costs, 50, -1.0, 300)
-    assert none.rows == rows[:1] and none.episodes == MIN_EPISODES
-    assert plan(rows, costs, 3, -1.0, 300).episodes == 3
-    many = plan(rows, costs, 2 * ENVIRONMENTS, math.inf, 300)  # two rounds
-    assert math.isclose(many.seconds, 2 * whole.seconds)
-
-
 def test_a_signal_ends_a_stage_between_two_steps_and_a_second_one_at_once(capsys):
     before = signal.getsignal(signal.SIGINT)
     with Stages(1.0) as stages:
@@ -318,7 +184,7 @@ def test_a_signal_ends_a_stage_between_two_steps_and_a_second_one_at_once(capsys
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(('sign', 'kept'), [
-    ('learning the place', 'not measured'), ('learning the ways', 'not measured'),
+    ('learning the place', 'not measured'), ('learning paths', 'not measured'),
     ('arrival · right goal', 'of 20 rows')])
 def test_after_sigint_there_is_a_whole_checkpoint_and_the_rows_so_far(sign, kept, bag, tmp_path):
     out = tmp_path / 'out'

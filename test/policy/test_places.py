@@ -1,4 +1,4 @@
-"""A place by heart: recorded pictures in other lights, where they were taken, and the ways."""
+"""Place recognition: recorded pictures in other lights, where they were taken, and paths."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.learning.auxiliary import imitation_loss
-from vn_nav.learning.places import fit_places, fit_routes, recognise, spread_spots
+from vn_nav.learning.places import fit_paths, fit_places, recognise, spread_spots
 from vn_nav.learning.teach_network import widened
 from vn_nav.observation import Observation
 from vn_nav.policy.network import Policy
@@ -68,17 +68,17 @@ def fitted():
     """A network that knows the striped world, and what was said of it."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    network, words = Policy(dataclasses.replace(CONFIG, places=24)), []
+    network, lines = Policy(dataclasses.replace(CONFIG, places=24)), []
     grid = np.random.default_rng(0).uniform(0, 4, (500, 2))
     facts = fit_places(network, Stripes(0), Stripes(1), grid, minutes=0.001, least=30_000,
-                       say=words.append)
-    return network, facts, words
+                       say=lines.append)
+    return network, facts, lines
 
 
 def test_the_recogniser_learns_where_pictures_were_taken(fitted):
-    network, facts, words = fitted
+    network, facts, lines = fitted
     assert facts['metres'] < 0.8 and facts['degrees'] < 20  # chance: 1.5 m, 90 deg
-    assert len(words) >= 3 and f'{facts["metres"]:.2f} m' in words[-1]
+    assert len(lines) >= 3 and f'{facts["metres"]:.2f} m' in lines[-1]
     code = recognise(network, Stripes(2).draw(50)[0])
     assert code.shape == (50, 24 + HEADINGS)
     assert torch.allclose(code.sum(1), torch.full((50,), 2.0), atol=1e-3)
@@ -93,10 +93,10 @@ def test_routes_learn_the_first_actions_of_ways(fitted):
     behind = (ends[:, None, 0] < poses[None, :, 0])[..., None]
     regrets = np.where(behind == np.arange(4), 0, 2).astype(np.float16)
     regrets[..., 2:] = 5
-    words = []
-    facts = fit_routes(network, pictures, goals, regrets, until=time.monotonic(),
-                       say=words.append, least=200_000)
-    assert facts['regret'] < 0.3 and facts['ways'] >= 200_000 and len(words) == 1
+    lines = []
+    facts = fit_paths(network, pictures, goals, regrets, until=time.monotonic(),
+                      say=lines.append, least=200_000)
+    assert facts['regret'] < 0.3 and facts['ways'] >= 200_000 and len(lines) == 1
     new, ends = Stripes(5).draw(16)
     here, there = recognise(network, pictures), recognise(network, new)
     advised = network.routes(here.repeat(16, 1), there.repeat_interleave(256, 0))[1].argmax(1)

@@ -17,18 +17,19 @@ from vn_nav.errors import UserError
 def add_place_options(parser: argparse.ArgumentParser) -> None:
     """How pictures become a place."""
     from vn_nav.bags.mapping.recorded_place import MAX_GOALS
-    parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
+    parser.add_argument('--topics', type=Path, metavar='YAML',
+                        help='names of the topics in the bag')
     parser.add_argument('--margin', type=float, metavar='M',
                         help='around the driven path that counts as free [m]; default 0.3')
     parser.add_argument('--straighten', action=argparse.BooleanOptionalAction, default=True,
                         help='correct odometry by loop closure: by the places that the drive '
                         'shows twice (docs/bags.md)')
-    parser.add_argument('--pictures', metavar='A-B[,C-D]', help='numbers of those to learn from; '
-                        'several ranges: you vouch for their odometry being in one frame')
+    parser.add_argument('--pictures', metavar='A-B[,C-D]', help='numbers of the pictures to '
+                        'learn from; several ranges: you vouch that their odometry has one frame')
     parser.add_argument('--goals', type=int, default=MAX_GOALS,
                         help='pictures to drive to, at most')
-    parser.add_argument('--cache', type=Path, metavar='DIR', help='that keeps decoded bags; '
-                        'default: `decoded` in the folder of a run, or none')
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='folder of decoded '
+                        'bags; default: `decoded` in the folder of a run, or none')
 
 
 def given_place_options(args: argparse.Namespace) -> list[str]:

@@ -22,9 +22,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', type=Path, required=True, help='folder of the run')
     parser.add_argument('--resume', action='store_true', help='go on with the run in --out')
     parser.add_argument('--init', type=Path, metavar='CHECKPOINT',
-                        help='begin with its weights; network, size and actions are its own')
+                        help='begin with the weights of this checkpoint, its network, size and '
+                        'actions')
     parser.add_argument('--preset', choices=tuple(PRESETS),
-                        help='whose network; default: of --init, or fast')
+                        help='its network is trained; default: that of --init, or fast')
     parser.add_argument('--size', type=int, help='side of the pictures [pixels]; default 84')
     parser.add_argument('--actions', help="names from the robot's table, with commas between; "
                         f'default {",".join(DRIVE_ACTIONS)}')
@@ -34,18 +35,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--epochs', type=int, default=numbers.epochs, help='passes over the bags')
     parser.add_argument('--batch', type=int, default=numbers.batch, help='pictures in a step')
     parser.add_argument('--learning-rate', type=float, default=numbers.learning_rate,
-                        help='of Adam, at the start; falls to a twentieth')
-    parser.add_argument('--heads', default='auto', metavar='NAMES', help='auto (what the bags '
-                        'have the keys for, and what the preset has of the others), none, or '
+                        help='of Adam at the start; it falls to a twentieth')
+    parser.add_argument('--heads', default='auto', metavar='NAMES', help='heads to train: auto '
+                        '(those that the bags have data for, and others of the preset), none, or '
                         f'some of {", ".join(name for name in PARTS if name != "cloning")}')
     parser.add_argument('--cloning', action=argparse.BooleanOptionalAction,
-                        help='imitate the actions driven, towards pictures taken later; default: '
-                        'if the bags have some')
+                        help='imitate the recorded actions, with pictures taken later as goals; '
+                        'default: if the bags have actions')
     parser.add_argument('--topics', type=Path, metavar='YAML', help='names of the topics')
     parser.add_argument('--robot', type=Path, metavar='YAML',
-                        help='that drove; default: the standard robot')
+                        help='the robot that drove; default: the standard robot')
     parser.add_argument('--cache', type=Path, metavar='DIR',
-                        help='of decoded bags; default: OUT/decoded')
+                        help='folder of decoded bags; default: OUT/decoded')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--threads', type=int, default=1, help='of torch')
     parser.add_argument('--device', default='cpu', help='cpu, or a GPU such as cuda:0')

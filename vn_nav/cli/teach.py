@@ -17,12 +17,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder or MCAP file')
     parser.add_argument('--out', type=Path, required=True, help='folder of the run')
     parser.add_argument('--checkpoint', type=Path, metavar='DIR', help='begin with this policy, '
-                        'for example models/anywhere: network, size and actions are its own; '
+                        'its network, size and actions, for example models/anywhere; '
                         'default: from nothing')
-    parser.add_argument('--minutes', type=float, default=10.0, help='that all of it takes: '
+    parser.add_argument('--minutes', type=float, default=10.0, help='time for all: '
                         'reading the bag, learning and evaluation (docs/bags.md)')
     parser.add_argument('--robot', type=Path, metavar='YAML',
-                        help='that drove, with its camera; default: the standard robot')
+                        help='the robot that drove, with its camera; default: the standard robot')
     add_place_options(parser)
     parser.add_argument('--places', type=int, default=PLACES, metavar='K', help='place cells '
                         'by which the policy recognises the place; 0: none')

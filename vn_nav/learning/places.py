@@ -96,21 +96,21 @@ def fit_places(network: Policy, source: Views, judge: Views, positions: np.ndarr
     return {'metres': metres, 'degrees': degrees, 'pictures': seen}
 
 
-def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets: np.ndarray, *,
-               until: float, say: Callable[[str], None], seed: int = 0, least: int = 1,
-               show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
-    """Teach `PathAdvice` the shortest ways, by what the classifier says of pictures.
+def fit_paths(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets: np.ndarray, *,
+              until: float, say: Callable[[str], None], seed: int = 0, least: int = 1,
+              show: Callable[[float], None] = lambda share: None) -> dict[str, float]:
+    """Teach `PathAdvice` the shortest paths, by what the classifier says of pictures.
 
-    Cross-entropy with `softened` choices. Each picture is recognised once, and a hundred thousand
-    ways a second are learned from.
+    Cross-entropy with `softened` choices. Each picture is recognised once. A second learns from a
+    hundred thousand paths.
 
     Args:
         network: with `places` that are fitted; only `routes` change.
-        pictures: [N,3,S,S] uint8 where ways begin; goals: [G,3,S,S] where they end.
+        pictures: [N,3,S,S] uint8 where paths begin; goals: [G,3,S,S] where they end.
         regrets: [G,N,A] decisions that each first action loses.
         until: `time.monotonic()` at which to end.
         say: called with a summary line.
-        least: ways to learn from, however long that takes.
+        least: paths to learn from, however long that takes.
         show: called before every step with the share that is over; it may raise.
 
     Returns:
@@ -137,7 +137,7 @@ def fit_routes(network: Policy, pictures: np.ndarray, goals: np.ndarray, regrets
         seen += PATH_BATCH
     some = torch.randperm(len(labels), generator=generator)[:MAX_JUDGED_GOALS]
     lost = _regret(network, here, there[some], labels[some])
-    say(f'ways: {seen:,} · the advised action loses {lost:.2f} decisions on average')
+    say(f'paths: {seen:,} · the advised action loses {lost:.2f} decisions on average')
     return {'regret': lost, 'ways': seen}
 
 

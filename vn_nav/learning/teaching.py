@@ -22,7 +22,7 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.measurement import new_result
 from vn_nav.learning.pairs import PairSource
-from vn_nav.learning.places import BATCH, MAX_START_PICTURES, fit_places, fit_routes
+from vn_nav.learning.places import BATCH, MAX_START_PICTURES, fit_paths, fit_places
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
 from vn_nav.learning.stages import Stages
 from vn_nav.learning.taught_place import Place, Watched
@@ -113,8 +113,8 @@ def _robot(job: TeachJob, given: LoadedCheckpoint | None) -> RobotSpec:
     before = given.info['camera_fov_deg'], given.info['camera_height']
     now = math.degrees(robot.camera_fov), robot.camera_height
     if any(abs(a - b) > 0.01 * b for a, b in zip(now, before, strict=True)):
-        print(f'the camera is another one ({now[0]:.0f} deg, {now[1]:g} m high) than the policy '
-              f'has learned with ({before[0]:.0f} deg, {before[1]:g} m): it gets used to it',
+        print(f'the camera ({now[0]:.0f} deg, {now[1]:g} m high) is not that of the policy '
+              f'({before[0]:.0f} deg, {before[1]:g} m): the policy adapts to it',
               flush=True)
     return robot.with_actions(given.config.actions, given.config.moves)
 
@@ -167,8 +167,8 @@ class Teaching:
         self.learned = max(left - self.evaluated, 0.0)
         chosen = self._plan(self.evaluated)
         if left <= 0:
-            print(f'{self.job.minutes:g} minutes are too few: reading the bag alone took '
-                  f'{read / 60:.1f}; the least is learned and measured', flush=True)
+            print(f'{self.job.minutes:g} minutes are too few: reading the bag took '
+                  f'{read / 60:.1f}; learning and evaluation are as short as possible', flush=True)
         elif chosen.missing:
             print(f'{self.job.minutes:g} minutes are few: all {len(self.rows)} rows of the '
                   f'evaluation, of {min(MIN_EPISODES, self.job.episodes)} episodes each, may take '
@@ -273,7 +273,7 @@ class Teaching:
 
     def _learn_places(self, config: TrainConfig, shares: tuple[float, float], folder: Path
                       ) -> None:
-        """Know the place and its ways by its pictures, each for a share of the learning.
+        """Learn place recognition and paths, each for a share of the learning.
 
         Writes the checkpoint into the folder, after an interruption too.
         """
@@ -281,12 +281,13 @@ class Teaching:
         facts: dict[str, float] = {}
         end, signal = begun + sum(shares) * self.learned, None
         try:
-            self._learn_spots_and_ways(network, shares[0] * self.learned, end, facts)
+            self._learn_places_and_paths(network, shares[0] * self.learned, end, facts)
         except KeyboardInterrupt as error:
             signal = error
         info = self._info()
         if not self.advised:
-            info['notes'] += ' Interrupted before any way was learned: it drives as it did before.'
+            info['notes'] += (' Interrupted before any path was learned: it drives as it did '
+                              'before.')
         elif self.given is not None:
             blend(network, own=1.0 if self.given.config.places else OWN_LOGIT_SHARE)
         save_checkpoint(folder, network, {
@@ -296,9 +297,9 @@ class Teaching:
         if signal is not None:
             raise signal
 
-    def _learn_spots_and_ways(self, network: Policy, seconds: float, end: float, facts: dict
-                              ) -> None:
-        """Fit both; `facts` are filled as far as it comes."""
+    def _learn_places_and_paths(self, network: Policy, seconds: float, end: float, facts: dict
+                                ) -> None:
+        """Fit the place classifier, then path advice; `facts` are filled on the way."""
         own, stages, say = self.own, self.stages, functools.partial(print, flush=True)
         views, others = self.place.make_views(own, self.robot, self.job.seed)
         facts |= fit_places(network, views, others, own.poses[:, :2],
@@ -309,17 +310,17 @@ class Teaching:
             MAX_START_PICTURES if left > FULL_SEARCH_S else MIN_START_PICTURES)
         regrets = self.place.regrets(
             own, poses, time.monotonic() + REGRET_TIME_SHARE * left,
-            functools.partial(stages, 'counting what actions lose'))
+            functools.partial(stages, 'counting the decisions that actions lose'))
         if len(regrets) < len(own.goals):
-            print(f'ways to {len(regrets)} of the {len(own.goals)} goals: for more there is no '
-                  'time', flush=True)
+            print(f'paths to {len(regrets)} of the {len(own.goals)} goals: there is no time for '
+                  'more', flush=True)
         goals = own.pictures[list(own.goal_nodes[:len(regrets)])]
 
         def show(share: float) -> None:
-            stages('learning the ways', share)
+            stages('learning paths', share)
             self.advised = True
-        facts |= fit_routes(network, pictures, goals, regrets, until=end, say=say,
-                            seed=self.job.seed, show=show)
+        facts |= fit_paths(network, pictures, goals, regrets, until=end, say=say,
+                           seed=self.job.seed, show=show)
 
     def _info(self) -> dict:
         part = f', pictures {self.job.options.pictures}' if self.job.options.pictures else ''
