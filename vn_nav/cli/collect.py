@@ -26,11 +26,11 @@ def run(args: argparse.Namespace) -> int:
     check_backend(args.backend)
     from vn_nav.bags.storage.writer import BagWriter
     from vn_nav.robot import RobotSpec, load_robot
-    from vn_sim_bridge.datasets.collect import collect, house_scenes
+    from vn_sim_bridge.datasets.collect import collect, random_views
     from vn_sim_bridge.render.randomisation import load_randomisation
     names = training_scenes(args)
     robot = load_robot(args.robot) if args.robot else RobotSpec()
-    scenes = house_scenes(names, args.size, robot, load_randomisation(args.randomisation),
+    scenes = random_views(names, args.size, robot, load_randomisation(args.randomisation),
                           args.seed, args.threads)
     begun = time.monotonic()
     done = collect(scenes, len(names), args.pictures, robot,
