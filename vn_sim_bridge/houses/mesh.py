@@ -46,6 +46,30 @@ def load_mesh(path: str | Path, *, labels: dict[str, str] | None = None,
             extension that is unknown here; or one that it refers to.
     """
     path = Path(path)
+    for name in {**(labels or {}), **({'default': default_label} if default_label else {})
+                 }.values():
+        if name not in LABEL:
+            raise UserError('a label is a known class', f'{path}: {name!r}',
+                            f'the classes are {", ".join(LABELS[1:])}')
+    if up not in (None, 'y', 'z'):
+        raise UserError("the axis that points up is 'y' or 'z'", up, 'choose one of them')
+    if not (math.isfinite(scale) and scale > 0):
+        raise UserError('the scale is positive', scale, 'give metres per unit of the file')
+    parts = read_parts(path, double_sided=double_sided)
+    class_ids = [_label(path, part.names, labels or {}, default_label) for part in parts]
+    return _scene(parts, class_ids, path, up or 'y', scale, double_sided)
+
+
+def read_parts(path: Path, *, double_sided: bool | None = None) -> list[Part]:
+    """The triangles of a mesh file, in its own axes and units.
+
+    Args:
+        path: an .obj, .glb or .gltf file.
+        double_sided: see `load_mesh`; for the limit of triangles.
+
+    Raises:
+        UserError: as `load_mesh`, less what it says of classes.
+    """
     try:
         import PIL.Image  # noqa: F401
     except ImportError as error:
@@ -56,18 +80,8 @@ def load_mesh(path: str | Path, *, labels: dict[str, str] | None = None,
                         'convert it, for instance with Blender')
     if not path.is_file():
         raise UserError('a mesh file exists', str(path), 'correct the path')
-    for name in {**(labels or {}), **({'default': default_label} if default_label else {})
-                 }.values():
-        if name not in LABEL:
-            raise UserError('a label is a known class', f'{path}: {name!r}',
-                            f'the classes are {", ".join(LABELS[1:])}')
-    if up not in (None, 'y', 'z'):
-        raise UserError("the axis that points up is 'y' or 'z'", up, 'choose one of them')
-    if not (math.isfinite(scale) and scale > 0):
-        raise UserError('the scale is positive', scale, 'give metres per unit of the file')
     try:
         parts = _within(READERS[path.suffix.lower()](path), path, double_sided)
-        class_ids = [_label(path, part.names, labels or {}, default_label) for part in parts]
     except UserError:
         raise
     except Exception as error:
@@ -76,7 +90,7 @@ def load_mesh(path: str | Path, *, labels: dict[str, str] | None = None,
                         f'{path}: {_words(error)}', 'export it again') from error
     if not parts:
         raise UserError('a mesh file has triangles', str(path), 'export the geometry, too')
-    return _scene(parts, class_ids, path, up or 'y', scale, double_sided)
+    return parts
 
 
 def _words(error: Exception) -> str:

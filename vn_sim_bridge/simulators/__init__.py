@@ -40,6 +40,9 @@ TABLE = {
                    'house:7?rooms=5'),
     'bag': Entry('vn_sim_bridge.simulators.recorded',
                  'the pictures of a recorded drive (depth where it has some)', 'bag:my_drive'),
+    'gltf': Entry('vn_sim_bridge.simulators.gltf',
+                  "scenes of GLB, glTF and OBJ files, and of Habitat's data sets",
+                  'gltf:flat.glb', ('PIL',), 'pip install "vn_nav[mesh]"'),
 }
 
 
