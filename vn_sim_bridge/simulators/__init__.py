@@ -40,6 +40,9 @@ TABLE = {
                    'house:7?rooms=5'),
     'bag': Entry('vn_sim_bridge.simulators.recorded',
                  'the pictures of a recorded drive (depth where it has some)', 'bag:my_drive'),
+    'thor': Entry('vn_sim_bridge.simulators.thor',
+                  'AI2-THOR, drawn by Unity', 'thor:FloorPlan227', ('ai2thor',),
+                  "pip install 'vn_nav[thor]'"),
 }
 
 
