@@ -107,6 +107,7 @@ class Capabilities:
     placeable_objects: bool = False  # `set_objects` works, and `view` shows objects
     appearance: bool = False  # `Setup.randomisation`: light and camera vary
     other_goals: bool = False  # `Setup.goals_per_room` and `Setup.goal_seed`
+    own_objects: bool = False  # places have movable objects of their own: `scatter`
     rewards: bool = False  # it pays and ends episodes itself: `Motion.reward`, `Motion.ended`
 
 
@@ -117,6 +118,7 @@ class Motion(NamedTuple):
     collided: np.ndarray  # [K] bool: it ended at a contact
     reward: np.ndarray | None = None  # [K] float32, of a simulator that pays itself
     ended: np.ndarray | None = None  # [K] bool: and has ended the episode
+    truncated: np.ndarray | None = None  # [K] bool: the simulator was lost meanwhile and replaced
 
 
 class Frames(NamedTuple):
@@ -241,6 +243,12 @@ class Simulator(Protocol):
     def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
         """Put these objects, and no others, about one robot (`capabilities.placeable_objects`)."""
 
+    def scatter(self, env_id: int, number: int) -> Mapping[str, tuple[float, float]]:
+        """Put one robot's place's own objects elsewhere (`capabilities.own_objects`).
+
+        The random number alone says where; the robot stays. Positions [m] by the objects' names.
+        """
+
     def object_models(self) -> np.ndarray:
         """[N,M] int64: which model each object is; -1: absent."""
 
@@ -356,6 +364,10 @@ class BaseSimulator(abc.ABC):
 
     def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
         """See `Simulator`: there are none."""
+
+    def scatter(self, env_id: int, number: int) -> Mapping[str, tuple[float, float]]:
+        """See `Simulator`: there are none."""
+        return {}
 
     def object_models(self) -> np.ndarray:
         """[N,0]: none."""

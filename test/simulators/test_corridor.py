@@ -259,7 +259,7 @@ def test_an_installed_package_adds_a_simulator_by_name(tmp_path):
 def test_what_is_missing_is_one_line_with_the_command(monkeypatch, capsys):
     from vn_sim_bridge import simulators
     with pytest.raises(UserError, match='house, bag'):
-        simulator_class('thor')
+        simulator_class('gazebo')
     with pytest.raises(UserError, match='PYTHONPATH'):
         simulator_class('nowhere.corridor')
     with pytest.raises(UserError, match='SIMULATOR'):

@@ -28,6 +28,7 @@ from vn_sim_bridge.navigation.episodes import draw_grip, draw_motion_scale, draw
 from vn_sim_bridge.navigation.explorer import Explorer
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
 from vn_sim_bridge.navigation.oracle import FloorOracle, turning_table
+from vn_sim_bridge.navigation.own_objects import OwnObjectGoal
 from vn_sim_bridge.navigation.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.simulator import Frames, Motion, Simulator
 from vn_sim_bridge.simulators import open_simulator
@@ -152,6 +153,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if config.task == 'image':
             return tasks.ImageGoal(self.places, config.num_envs, min_distance=distance,
                                    fixed_goals=config.one_goal_per_env)
+        if config.task == 'object' and self.simulator.capabilities.own_objects:
+            return OwnObjectGoal(self.places, self.simulator.scatter, min_distance=distance)
         models = objects_of(self.simulator, config.task)
         if config.task == 'object':
             return tasks.ObjectGoal(
@@ -387,7 +390,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._last_action[driving] = actions[driving]
         self._last_reward[acting] = verdict.reward[acting]
         terminated = ended | declared
-        truncated = ~terminated & ~reset & (self._step >= self.config.max_decisions)
+        lost = np.zeros(self.num_envs, bool)
+        if motion is not None and motion.truncated is not None:
+            lost[driving] = motion.truncated
+        truncated = ~terminated & ~reset & (lost | (self._step >= self.config.max_decisions))
         self._done = terminated | truncated
         observation, info = self._result(frames, reset, verdict.success, collided)
         return observation, reward, terminated, truncated, info

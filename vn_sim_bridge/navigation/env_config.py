@@ -160,7 +160,8 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
          f'configuration: {config.num_envs}', simulator.num_envs),
         (can.rooms or config.task != 'room', 'task room needs a simulator that knows rooms',
          config.task),
-        (can.placeable_objects or config.task not in ('object', 'collect'),
+        (can.placeable_objects or (can.own_objects and config.task == 'object')
+         or config.task not in ('object', 'collect'),
          'this task needs a simulator that places objects', config.task),
         (config.task not in ('object', 'collect') or objects_of(simulator, config.task),
          'a simulator that places objects names those of the task (task_objects)', config.task),

@@ -43,6 +43,9 @@ TABLE = {
     'gltf': Entry('vn_sim_bridge.simulators.gltf',
                   "scenes of GLB, glTF and OBJ files, and of Habitat's data sets",
                   'gltf:flat.glb', ('PIL',), 'pip install "vn_nav[mesh]"'),
+    'thor': Entry('vn_sim_bridge.simulators.thor',
+                  'AI2-THOR, drawn by Unity', 'thor:FloorPlan227', ('ai2thor',),
+                  "pip install 'vn_nav[thor]'"),
 }
 
 

@@ -1,0 +1,1 @@
+"""AI2-THOR: its client, frames, names and rooms, behind `simulators/thor.py`."""
