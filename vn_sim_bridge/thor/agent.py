@@ -285,4 +285,3 @@ class Agent:
             raise EngineLost('there is none')
         self._event = self._engine.act(action, **arguments)
         return self._event
-
