@@ -43,6 +43,9 @@ TABLE = {
     'gltf': Entry('vn_sim_bridge.simulators.gltf',
                   "scenes of GLB, glTF and OBJ files, and of Habitat's data sets",
                   'gltf:flat.glb', ('PIL',), 'pip install "vn_nav[mesh]"'),
+    'procthor': Entry('vn_sim_bridge.simulators.procthor',
+                      'houses of ProcTHOR, with boxes where there are no meshes',
+                      'procthor:house.json'),
 }
 
 
