@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.meshes.notices import say_once
+from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.meshes.parts import MAP, axes
 
 SUFFIX = '.scene_dataset_config.json'
