@@ -20,11 +20,11 @@ from vn_sim_bridge.houses.mesh import read_parts
 from vn_sim_bridge.houses.mesh_export import texture_picture
 from vn_sim_bridge.houses.polygons import triangles_of
 from vn_sim_bridge.houses.textures import TEXTURES, texture_library
-from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.meshes.parts import surfaces_of
 from vn_sim_bridge.meshes.place import RoomOutline
 from vn_sim_bridge.meshes.thor_sizes import SIZES, UNKNOWN
 from vn_sim_bridge.meshes.vocabulary import OTHER, Vocabulary, class_name
+from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.render.mesh_scene import Surface
 
 SWAP = np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]])  # Unity's axes to the map's
