@@ -11,7 +11,7 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_sim_bridge.houses.mesh import read_parts
 from vn_sim_bridge.houses.surface import Part, linear_from_srgb
-from vn_sim_bridge.meshes.notices import say_once
+from vn_sim_bridge.notices import say_once
 
 HEADER = 'HM3D Semantic Annotations'
 SPACING = 0.05  # m between samples of a semantic mesh

@@ -46,6 +46,9 @@ TABLE = {
     'thor': Entry('vn_sim_bridge.simulators.thor',
                   'AI2-THOR, drawn by Unity', 'thor:FloorPlan227', ('ai2thor',),
                   "pip install 'vn_nav[thor]'"),
+    'procthor': Entry('vn_sim_bridge.simulators.procthor',
+                      'houses of ProcTHOR, with boxes where there are no meshes',
+                      'procthor:house.json'),
 }
 
 
