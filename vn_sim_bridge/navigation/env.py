@@ -381,7 +381,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._last_action[driving] = actions[driving]
         self._last_reward[acting] = verdict.reward[acting]
         terminated = ended | declared
-        truncated = ~terminated & ~reset & (self._step >= self.config.max_decisions)
+        broken = self.simulator.broken_off()  # while an episode begins: it begins all the same
+        truncated = ~terminated & ~reset & (broken | (self._step >= self.config.max_decisions))
         self._done = terminated | truncated
         observation, info = self._result(frames, reset, verdict.success, collided)
         return observation, reward, terminated, truncated, info
