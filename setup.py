@@ -63,7 +63,10 @@ setup(
     packages=find_packages(include=[
         f'{package}{suffix}'
         for package in PACKAGES for suffix in ('', '.*')]),
-    package_data={package: ['py.typed'] for package in PACKAGES},  # PEP 561: they have types
+    package_data={  # PEP 561: they have types; and levels for DeepMind Lab
+        **{package: ['py.typed'] for package in PACKAGES},
+        'vn_sim_bridge.dmlab': ['levels/*.lua'],
+    },
     data_files=data_files,
     zip_safe=False,
     python_requires='>=3.11',

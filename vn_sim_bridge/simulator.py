@@ -118,7 +118,6 @@ class Motion(NamedTuple):
     collided: np.ndarray  # [K] bool: it ended at a contact
     reward: np.ndarray | None = None  # [K] float32, of a simulator that pays itself
     ended: np.ndarray | None = None  # [K] bool: and has ended the episode
-    truncated: np.ndarray | None = None  # [K] bool: the simulator was lost meanwhile and replaced
 
 
 class Frames(NamedTuple):
@@ -262,6 +261,12 @@ class Simulator(Protocol):
         Asked only where there is no depth.
         """
 
+    def broken_off(self) -> np.ndarray:
+        """[N] bool: whose episode broke off since the last call, by a crash for instance.
+
+        Such a robot can go on, but not in that episode: it is truncated.
+        """
+
     def close(self) -> None:
         """Let go of processes, files and memory; a second time it does nothing."""
 
@@ -381,6 +386,10 @@ class BaseSimulator(abc.ABC):
     def co_visibility(self, goal_poses: np.ndarray) -> np.ndarray:
         """See `Simulator`: poses say nothing."""
         return np.full(self.num_envs, -1.0, np.float32)
+
+    def broken_off(self) -> np.ndarray:
+        """See `Simulator`: nothing breaks off."""
+        return np.zeros(self.num_envs, bool)
 
     def close(self) -> None:
         """See `Simulator`: there is nothing to let go of."""

@@ -390,10 +390,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._last_action[driving] = actions[driving]
         self._last_reward[acting] = verdict.reward[acting]
         terminated = ended | declared
-        lost = np.zeros(self.num_envs, bool)
-        if motion is not None and motion.truncated is not None:
-            lost[driving] = motion.truncated
-        truncated = ~terminated & ~reset & (lost | (self._step >= self.config.max_decisions))
+        broken = self.simulator.broken_off()  # while an episode begins: it begins all the same
+        truncated = ~terminated & ~reset & (broken | (self._step >= self.config.max_decisions))
         self._done = terminated | truncated
         observation, info = self._result(frames, reset, verdict.success, collided)
         return observation, reward, terminated, truncated, info

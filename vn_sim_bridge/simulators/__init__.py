@@ -15,6 +15,8 @@ import dataclasses
 import importlib
 import importlib.metadata
 import importlib.util
+import subprocess
+import sys
 from collections.abc import Sequence
 
 from vn_nav.errors import UserError
@@ -33,6 +35,8 @@ class Entry:
     scene: str  # an example of a scene's name
     needs: tuple[str, ...] = ()  # modules that are not always installed
     install: str = ''  # the command that installs them
+    pip: tuple[str, ...] = ()  # what `vn_nav simulators install` asks pip for
+    setup: str = ''  # or a module with `missing()` and `install(system)`, where pip will not do
 
 
 TABLE = {
@@ -49,6 +53,9 @@ TABLE = {
     'procthor': Entry('vn_sim_bridge.simulators.procthor',
                       'houses of ProcTHOR, with boxes where there are no meshes',
                       'procthor:house.json'),
+    'dmlab': Entry('vn_sim_bridge.simulators.dmlab', 'DeepMind Lab: arena, mazes, a house, levels',
+                   'dmlab:maze?seed=3', install='vn_nav simulators install dmlab',
+                   setup='vn_sim_bridge.dmlab.install'),
 }
 
 
@@ -63,7 +70,34 @@ def table() -> dict[str, Entry]:
 
 def missing(entry: Entry) -> list[str]:
     """What a simulator needs and this machine lacks."""
-    return [name for name in entry.needs if importlib.util.find_spec(name) is None]
+    lacking = [name for name in entry.needs if importlib.util.find_spec(name) is None]
+    return lacking + (importlib.import_module(entry.setup).missing() if entry.setup else [])
+
+
+def install(name: str, *, system: bool = False) -> str:
+    """Install what a simulator needs; what was done, in a line.
+
+    Args:
+        name: of a row of the table.
+        system: also Debian packages, as root.
+
+    Raises:
+        UserError: there is no such row, or something could not be installed.
+    """
+    entry = table().get(name)
+    if entry is None or not (entry.pip or entry.setup):
+        able = ', '.join(row for row, entry in table().items() if entry.pip or entry.setup)
+        raise UserError(f'a simulator that is installed by this command is one of: {able}', name,
+                        'choose one (vn_nav simulators)')
+    if entry.setup:
+        return importlib.import_module(entry.setup).install(system)
+    command = [sys.executable, '-m', 'pip', 'install', '-qq', '--disable-pip-version-check',
+               *entry.pip]
+    if subprocess.run(command).returncode:
+        raise UserError(f'pip installs {" ".join(entry.pip)}', 'it failed, see above',
+                        'correct it and try again')
+    importlib.invalidate_caches()
+    return f'{name}: {" ".join(entry.pip)}'
 
 
 def simulator_class(name: str) -> type[BaseSimulator]:
