@@ -48,10 +48,10 @@ class Distance(Protocol):
 
     @property
     def maximum(self) -> float:
-        """The largest distance of the place [m]."""
+        """The largest distance of the place [m, or steps with `capabilities.steps`]."""
 
     def at(self, poses: np.ndarray) -> np.ndarray:
-        """Of poses [K,>=2] to the goal, [K] m; inf where there is no way."""
+        """Of poses [K,>=2] to the goal, [K] m or steps; inf where there is no way."""
 
 
 class StraightDistance:
@@ -96,7 +96,7 @@ class Place(Protocol):
 class Capabilities:
     """What a simulator can do. A task that needs more refuses before its first step."""
 
-    continuous: bool  # any displacement; False: only whole actions of the robot, on a grid
+    continuous: bool  # any displacement; False: whole actions, on a grid: no noise, no slip
     depth: bool  # `Frames.depth` is what the camera sees; False: zeros
     labels: bool  # `Frames.labels` are classes of `label_names`; False: zeros
     geodesic: bool  # places know driving distances
@@ -108,6 +108,8 @@ class Capabilities:
     appearance: bool = False  # `Setup.randomisation`: light and camera vary
     other_goals: bool = False  # `Setup.goals_per_room` and `Setup.goal_seed`
     rewards: bool = False  # it pays and ends episodes itself: `Motion.reward`, `Motion.ended`
+    steps: bool = False  # distances count decisions, of which a move and a turn are one each
+    own_actions: bool = False  # it has actions of its own, which are no motions: `act`
 
 
 class Motion(NamedTuple):
@@ -117,6 +119,7 @@ class Motion(NamedTuple):
     collided: np.ndarray  # [K] bool: it ended at a contact
     reward: np.ndarray | None = None  # [K] float32, of a simulator that pays itself
     ended: np.ndarray | None = None  # [K] bool: and has ended the episode
+    truncated: np.ndarray | None = None  # [K] bool: the simulator was lost meanwhile and replaced
 
 
 class Frames(NamedTuple):
@@ -211,6 +214,16 @@ class Simulator(Protocol):
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
         """Displace robots by [K,4] in their own frames, up to the first contact."""
 
+    def act(self, actions: np.ndarray, env_ids: np.ndarray) -> Motion:
+        """In place of `move`: actions [K] of its own, by number (`capabilities.own_actions`)."""
+
+    @property
+    def feature_size(self) -> int:
+        """F, how many frozen features `features` knows of a picture; 0: none."""
+
+    def features(self, place_index: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Frozen features [K,F] float32 of the pictures that `view` has, computed long ago."""
+
     def observe(self, env_ids: np.ndarray | None = None, keys: np.ndarray | None = None) -> Frames:
         """Pictures of the robots' cameras.
 
@@ -270,6 +283,7 @@ class BaseSimulator(abc.ABC):
     """
 
     version: str = '1'
+    feature_size: int = 0
     capabilities: Capabilities
     label_names: Sequence[str] = ()
     # Names of movable objects, by task: `object` goes to one of them, in `collect` the first is
@@ -300,6 +314,20 @@ class BaseSimulator(abc.ABC):
         """Pictures from poses [K,4] in places [K]."""
         raise UserError('a simulator draws pictures from any pose', type(self).__name__,
                         'write its `draw`, or `observe` and `view`')
+
+    @classmethod
+    def own_robot(cls, scenes: Sequence[SceneName], robot: RobotSpec) -> RobotSpec:
+        """The robot that drives in some scenes unless another one is named; `robot`: standard."""
+        return robot
+
+    def act(self, actions: np.ndarray, env_ids: np.ndarray) -> Motion:
+        """See `Simulator`."""
+        raise UserError('a simulator with actions of its own does them', type(self).__name__,
+                        'write its `act`')
+
+    def features(self, place_index: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """See `Simulator`: nobody knows any."""
+        return np.zeros((len(poses), 0), np.float32)
 
     @property
     def seen_from(self) -> np.ndarray:

@@ -6,11 +6,14 @@ import argparse
 import dataclasses
 import textwrap
 
+from vn_nav.cli import simulators_dump
 from vn_nav.errors import UserError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """It has none."""
+    """The actions of `vn_nav simulators`; none: the list."""
+    actions = parser.add_subparsers(dest='action', metavar='ACTION')
+    simulators_dump.add_action(actions)
 
 
 def run(args: argparse.Namespace) -> int:

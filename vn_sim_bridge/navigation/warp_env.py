@@ -739,6 +739,7 @@ class WarpNavigationEnv:
         return self._state['house']
 
     restorable = True  # see `NavigationEnv.restorable`
+    distance_unit = 'm'  # see `NavigationEnv.distance_unit`
 
     def close(self) -> None:
         """Nothing is held beyond the arrays, which go with this object."""
