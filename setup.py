@@ -89,6 +89,10 @@ setup(
         # Wheels for x86-64 machines without ROS. Where Jazzy is installed they come from apt.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'train': ['tensorboard>=2.16'],
+        'grid': ['h5py>=3.8'],  # grid scenes: dumps of AI2-THOR are HDF5 files
+        # Gymnasium environments with pictures, `gym:NAME`; small ones that run without a display.
+        'miniworld': ['miniworld>=2.1'],
+        'vizdoom': ['vizdoom>=1.2.4'],
         'mesh': ['pillow>=10'],  # the textures of OBJ, GLB and glTF files
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`

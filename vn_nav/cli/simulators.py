@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import textwrap
 
+from vn_nav.cli import simulators_dump
 from vn_nav.errors import UserError
 
 
@@ -17,6 +18,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     action.add_argument('--system', action='store_true',
                         help='also Debian packages; only as root')
     action.set_defaults(run=_install)
+    simulators_dump.add_action(actions)
 
 
 def _install(args: argparse.Namespace) -> int:

@@ -20,6 +20,7 @@ import sys
 from collections.abc import Sequence
 
 from vn_nav.errors import UserError
+from vn_nav.robot import RobotSpec
 from vn_nav.scenes import one_simulator
 from vn_sim_bridge.simulator import BaseSimulator, Setup, Simulator
 
@@ -56,6 +57,9 @@ TABLE = {
     'dmlab': Entry('vn_sim_bridge.simulators.dmlab', 'DeepMind Lab: arena, mazes, a house, levels',
                    'dmlab:maze?seed=3', install='vn_nav simulators install dmlab',
                    setup='vn_sim_bridge.dmlab.install'),
+    'grid': Entry('vn_sim_bridge.simulators.thor_grid',
+                  'grids of pictures: dumps of AI2-THOR, and of other scenes',
+                  'grid:bathroom_02?goals=26,37', ('h5py',), "pip install 'vn_nav[grid]'"),
 }
 
 
@@ -129,6 +133,18 @@ def simulator_class(name: str) -> type[BaseSimulator]:
     except AttributeError as error:
         raise UserError(f'the module {module} has a class SIMULATOR', str(error),
                         'name one on BaseSimulator so') from error
+
+
+def robot_for(scenes: Sequence[str], robot: RobotSpec | None = None) -> RobotSpec:
+    """A robot for some scenes, all of one simulator: the given one, or the scenes' own.
+
+    Raises:
+        UserError: scenes of several simulators, or one that there is not.
+    """
+    if robot is not None:
+        return robot
+    name, parsed = one_simulator(scenes)
+    return simulator_class(name).own_robot(parsed, RobotSpec())
 
 
 def open_simulator(scenes: Sequence[str], setup: Setup) -> Simulator:
