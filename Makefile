@@ -101,7 +101,8 @@ $(READY): setup.py constraints.txt
 # The GPU kernels run in Warp's CPU mode too, but only some tests need its 400 MB; or the 280 MB of
 # a video encoder and Parquet.
 $(READY_ALL): $(READY)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot,thor,miniworld,vizdoom]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot,miniworld,vizdoom]'
+	@PIP_CONSTRAINT=constraints.txt $(BIN)/vn_nav simulators install thor >/dev/null
 	@touch $@
 
 $(READY_DOCS): $(READY)

@@ -96,10 +96,6 @@ setup(
         'mesh': ['pillow>=10'],  # the textures of OBJ, GLB and glTF files
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`
-        # AI2-THOR's client (Apache-2.0; its Unity build is fetched at run time): 20 packages that
-        # nobody else needs. It brings OpenCV once more, with windows, into the folder of the one
-        # above: named here so that constraints.txt keeps both at one version.
-        'thor': ['ai2thor>=5,<6', 'opencv-python>=4.6'],
         'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels
         'docs': [  # `make docs`
             'sphinx>=8.2',

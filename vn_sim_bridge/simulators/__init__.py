@@ -36,10 +36,14 @@ class Entry:
     scene: str  # an example of a scene's name
     needs: tuple[str, ...] = ()  # modules that are not always installed
     install: str = ''  # the command that installs them
-    pip: tuple[str, ...] = ()  # what `vn_nav simulators install` asks pip for
+    pip: tuple[tuple[str, ...], ...] = ()  # what `vn_nav simulators install` asks pip for, in turn
     setup: str = ''  # or a module with `missing()` and `install(system)`, where pip will not do
 
 
+# The client of AI2-THOR and what it needs, but for opencv-python: that lies in the folder of
+# opencv-python-headless, and needs libGL, which a machine without a display may lack.
+THOR = (('aws-requests-auth', 'botocore', 'flask', 'msgpack', 'pillow', 'progressbar2',
+         'python-xlib', 'requests', 'werkzeug'), ('--no-deps', 'ai2thor>=5,<6'))
 TABLE = {
     'house': Entry('vn_sim_bridge.simulators.house', 'procedural houses, drawn by this package',
                    'house:7?rooms=5'),
@@ -50,7 +54,7 @@ TABLE = {
                   'gltf:flat.glb', ('PIL',), 'pip install "vn_nav[mesh]"'),
     'thor': Entry('vn_sim_bridge.simulators.thor',
                   'AI2-THOR, drawn by Unity', 'thor:FloorPlan227', ('ai2thor',),
-                  "pip install 'vn_nav[thor]'"),
+                  'vn_nav simulators install thor', pip=THOR),
     'procthor': Entry('vn_sim_bridge.simulators.procthor',
                       'houses of ProcTHOR, with boxes where there are no meshes',
                       'procthor:house.json'),
@@ -95,13 +99,14 @@ def install(name: str, *, system: bool = False) -> str:
                         'choose one (vn_nav simulators)')
     if entry.setup:
         return importlib.import_module(entry.setup).install(system)
-    command = [sys.executable, '-m', 'pip', 'install', '-qq', '--disable-pip-version-check',
-               *entry.pip]
-    if subprocess.run(command).returncode:
-        raise UserError(f'pip installs {" ".join(entry.pip)}', 'it failed, see above',
-                        'correct it and try again')
+    for packages in entry.pip:
+        command = [sys.executable, '-m', 'pip', 'install', '-qq', '--disable-pip-version-check',
+                   *packages]
+        if subprocess.run(command).returncode:
+            raise UserError(f'pip installs {" ".join(packages)}', 'it failed, see above',
+                            'correct it and try again')
     importlib.invalidate_caches()
-    return f'{name}: {" ".join(entry.pip)}'
+    return f'{name}: {", ".join(" ".join(packages) for packages in entry.pip)}'
 
 
 def simulator_class(name: str) -> type[BaseSimulator]:
