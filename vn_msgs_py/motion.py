@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-FARTHEST_M = 1e8  # m: UTM coordinates are within; a pose beyond is a driver's fault
-FASTEST = 1e3  # m/s, rad/s
+MAX_POSITION_M = 1e8  # m: UTM coordinates are within; a pose beyond is a driver's fault
+MAX_SPEED_M_RAD_PER_S = 1e3  # m/s, rad/s
 
 
 class MotionError(ValueError):
@@ -63,9 +63,11 @@ def odometry_to_array(message: Any) -> np.ndarray:
                        message.header.stamp.sec + message.header.stamp.nanosec * 1e-9])
     if not np.isfinite(values).all():
         raise MotionError('odometry is finite', values.tolist(), 'check the base driver')
-    if np.abs(values[:2]).max() > FARTHEST_M or np.abs(values[3:6]).max() > FASTEST:
-        raise MotionError(f'a pose lies within {FARTHEST_M:g} m, and no robot is faster than '
-                          f'{FASTEST:g} m/s', values.tolist(), 'check the base driver')
+    position, speed = np.abs(values[:2]).max(), np.abs(values[3:6]).max()
+    if position > MAX_POSITION_M or speed > MAX_SPEED_M_RAD_PER_S:
+        raise MotionError(f'a pose lies within {MAX_POSITION_M:g} m, and no robot is faster than '
+                          f'{MAX_SPEED_M_RAD_PER_S:g} m/s', values.tolist(),
+                          'check the base driver')
     return values
 
 

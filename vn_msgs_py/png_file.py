@@ -20,7 +20,7 @@ from vn_msgs_py.image_error import ImageError, TooLargeError, check_size, damage
 SIGNATURE = b'\x89PNG\r\n\x1a\n'
 MAX_CHUNKS = 20_000  # 16 million pixels in IDAT chunks of 8 kB are about 12,000
 MAX_INFLATED_BYTES = 66_000_000  # 16 million pixels of four bytes, with their rows' filter bytes
-MOST_EXPANSION = 1032  # bytes that a byte of deflate can become: 258 for two bits
+MAX_EXPANSION = 1032  # bytes that a byte of deflate can become: 258 for two bits
 SUB_BYTES = 1 << 23  # rows of the filter Sub that are put together here; two copies are needed
 CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type: grey, RGB, palette, and with alpha
 DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}  # bits
@@ -124,7 +124,7 @@ def _check_amount(png: PngFile) -> None:
     if size > MAX_INFLATED_BYTES:
         raise TooLargeError(f'the pixels of a PNG take at most {MAX_INFLATED_BYTES} bytes', size,
                             'lower its resolution, or save it with 8 bits')
-    if given * MOST_EXPANSION < size:
+    if given * MAX_EXPANSION < size:
         raise _truncated(f'{given} bytes for {png.width} x {png.height} pixels')
 
 

@@ -21,7 +21,7 @@ from vn_nav.bags.storage.stream import messages
 
 # Like ODOMETRY_JUMP_M and ODOMETRY_JUMP_M_PER_S, for turns: the largest correction at once, and
 # more than the turn rate of any robot.
-TURN_JUMP, TURN_SPEED = math.radians(45), 2 * math.pi  # rad, rad/s
+TURN_JUMP_RAD, TURN_SPEED_RAD_PER_S = math.radians(45), 2 * math.pi  # rad, rad/s
 # After so long without odometry the robot may have been carried, or its odometry restarted, ...
 ODOMETRY_GAP_S = 10.0
 STANDSTILL_M_RAD = (0.05, math.radians(3))  # m, rad: ... unless its pose is the same
@@ -108,7 +108,7 @@ def _reason(last: np.ndarray, now: np.ndarray, frame: str, name: str) -> str:
         return f'the clock of odometry goes back by {-seconds:.1f} s'
     if moved > ODOMETRY_JUMP_M + ODOMETRY_JUMP_M_PER_S * seconds:
         return f'odometry jumps by {moved:.1f} m in {seconds:.2f} s'
-    if turned > TURN_JUMP + TURN_SPEED * seconds:
+    if turned > TURN_JUMP_RAD + TURN_SPEED_RAD_PER_S * seconds:
         return f'odometry turns by {math.degrees(turned):.0f} deg in {seconds:.2f} s'
     if seconds > ODOMETRY_GAP_S and (moved > STANDSTILL_M_RAD[0] or turned > STANDSTILL_M_RAD[1]):
         return f'odometry is silent for {seconds:.0f} s and then {moved:.1f} m away'

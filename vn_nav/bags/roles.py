@@ -21,7 +21,7 @@ TYPES = {  # of each role of `Topics`
     'command': ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'),
     'goal': (IMAGE, COMPRESSED), 'depth': (IMAGE,), 'labels': (IMAGE,),
     'episode_end': ('std_msgs/msg/UInt8',), 'camera_info': ('sensor_msgs/msg/CameraInfo',)}
-LISTED = 4  # topics that are proposed, at most
+MAX_PROPOSED_TOPICS = 4  # topics that are proposed, at most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +115,8 @@ def proposal(role: str, recorded: Mapping[str, str]) -> str:
         recorded: types of the topics that could have it, by name.
     """
     others = sorted(name for name, kind in recorded.items() if fits(role, kind))
-    return (f'name one of {", ".join(others[:LISTED])} in a YAML file ({role}: {others[0]}) and '
-            'give it with --topics' if others else '')
+    return (f'name one of {", ".join(others[:MAX_PROPOSED_TOPICS])} in a YAML file '
+            f'({role}: {others[0]}) and give it with --topics' if others else '')
 
 
 def replaced(role: str, kinds: Mapping[str, str]) -> bool:

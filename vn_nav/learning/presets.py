@@ -26,7 +26,7 @@ from vn_nav.errors import UserError
 from vn_nav.labels import CLASSES
 from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.policy.action_filter import NONE
-from vn_nav.policy.encoders import LARGE
+from vn_nav.policy.encoders import LARGE_LAYOUT_PX
 from vn_nav.policy.network_config import NetworkConfig
 
 
@@ -61,7 +61,8 @@ class TrainConfig(LearnerConfig):
     features: int = 256
     hidden: int = 256
     stacked_frames: int = 1
-    deconvolutions: int | None = None  # None: one below `LARGE` pixels, else two (table 5.1)
+    # None: one below `LARGE_LAYOUT_PX` pixels, else two (table 5.1).
+    deconvolutions: int | None = None
     pose_to_memory: bool = False
     places: int = 0  # place cells of a place that `vn_nav teach` has taught
     track_goal: bool = False  # by dead reckoning, see `vn_nav.policy.memory.GoalTracker`
@@ -155,7 +156,7 @@ class TrainConfig(LearnerConfig):
             moves: what the actions do, see `NetworkConfig.moves`; for `track_goal` alone.
             classes: of the labels that segmentation heads draw.
         """
-        deconvolutions = self.deconvolutions or (1 if size < LARGE else 2)
+        deconvolutions = self.deconvolutions or (1 if size < LARGE_LAYOUT_PX else 2)
         heads = dict.fromkeys((*self.heads, *self.extra_heads))
         return NetworkConfig(
             actions=actions, size=size, architecture=self.architecture, channels=self.channels,

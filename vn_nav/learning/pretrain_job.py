@@ -33,7 +33,7 @@ from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 RANDOM_POSES = 'random'  # the entry `poses` of the topic scene in bags of `vn_nav collect`
-SIZE = 84  # pixels a side of the pictures, by default
+DEFAULT_SIZE_PX = 84  # pixels a side of the pictures, by default
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _robot_and_network(job: PretrainJob, given: LoadedCheckpoint | None,
     robot, actions = job.robot, job.actions
     if given is None:
         robot = robot.with_actions(actions or DRIVE_ACTIONS)
-        return robot, train.network(robot.action_names, job.size or SIZE, robot.moves)
+        return robot, train.network(robot.action_names, job.size or DEFAULT_SIZE_PX, robot.moves)
     network = given.config
     for option, asked, own in (('--actions', actions, network.actions),
                                ('--size', job.size, network.size)):

@@ -22,7 +22,7 @@ TEACHER = {'imitation': 1.0, 'imitation_until': 1.0, 'teacher': 'routes', 'teach
 FROM_NOTHING = {'epochs': 4, 'minibatches': 8, 'learning_rate': 1e-3}
 PAIR_SHARE = 0.1  # of learning from nothing, for picture pairs
 PLACES = 64  # place cells that the policy distinguishes
-SIZE = 84  # pixels a side of the pictures, by default
+DEFAULT_SIZE_PX = 84  # pixels a side of the pictures, by default
 
 
 @dataclasses.dataclass(frozen=True)

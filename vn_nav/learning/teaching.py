@@ -37,7 +37,7 @@ from vn_nav.learning.teach_evaluation import (
     plan,
     rows_of,
 )
-from vn_nav.learning.teach_job import PRESET, SIZE, TeachJob, numbers
+from vn_nav.learning.teach_job import DEFAULT_SIZE_PX, PRESET, TeachJob, numbers
 from vn_nav.learning.teach_network import OWN_LOGIT_SHARE, blend, network_for_place
 from vn_nav.learning.trainer import train
 from vn_nav.learning.training import CHECKPOINT, STATE
@@ -90,7 +90,7 @@ def teach(job: TeachJob, place: Place) -> Path:
     with Stages(job.minutes) as stages:
         run = None
         try:
-            size = given.config.size if given else job.size or SIZE
+            size = given.config.size if given else job.size or DEFAULT_SIZE_PX
             graph = read_place(bag, job.options, place.build_graph, robot, size,
                                Path(job.cache or out / 'decoded'), stages,
                                stages.at(SEARCH_TIME_SHARE))

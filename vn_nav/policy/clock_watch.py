@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-BACK_S = 0.1  # a step of NTP below this moves no robot
-AHEAD_S = 1.0
-FASTEST = 10.0  # a simulator may run this many times faster than the steady clock
+MAX_STEP_BACK_S = 0.1  # a step of NTP below this moves no robot
+MAX_STEP_AHEAD_S = 1.0
+MAX_CLOCK_RATE = 10.0  # a simulator may run this many times faster than the steady clock
 
 
 class ClockWatch:
@@ -15,7 +15,7 @@ class ClockWatch:
     """
 
     def __init__(self, *, simulated: bool):
-        self._fastest = FASTEST if simulated else 1.0
+        self._fastest = MAX_CLOCK_RATE if simulated else 1.0
         self._clock: float | None = None
         self._steady = 0.0
 
@@ -33,8 +33,8 @@ class ClockWatch:
         if before is None:
             return ''
         change = clock - before
-        if change < -BACK_S:
+        if change < -MAX_STEP_BACK_S:
             return f'the clock went back by {-change:.4g} s'
-        if change > AHEAD_S + self._fastest * passed:
+        if change > MAX_STEP_AHEAD_S + self._fastest * passed:
             return f'the clock jumped ahead by {change:.4g} s'
         return ''

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-LARGE = 128  # pixels: from here on the thesis network has its layout for 174 x 174
+LARGE_LAYOUT_PX = 128  # pixels: from here on the thesis network has its layout for 174 x 174
 
 
 def apply(layer: nn.Conv2d | nn.Linear | nn.ConvTranspose2d, x: Tensor) -> Tensor:
@@ -251,16 +251,17 @@ class Matching(nn.Module):
 class TwoStreams(nn.Module):
     """The thesis's base (figure 4.2): shared convolutions on picture and goal, then one trunk.
 
-    84 x 84: shared 3->16 8x8/4; trunk 32->32 4x4/2, 32->32 1x1, linear 2592->512. From `LARGE`
-    pixels on, as for 174 x 174: shared 3->32 7x7/4, 32->32 4x4/2; trunk 64->64 4x4/2, 64->32 1x1,
-    linear 2592->512. ReLU after each. The last maps have 32 channels and, at both sizes, side 9.
+    84 x 84: shared 3->16 8x8/4; trunk 32->32 4x4/2, 32->32 1x1, linear 2592->512. From
+    `LARGE_LAYOUT_PX` on, as for 174 x 174: shared 3->32 7x7/4, 32->32 4x4/2; trunk 64->64 4x4/2,
+    64->32 1x1, linear 2592->512. ReLU after each. The last maps have 32 channels and, at both
+    sizes, side 9.
     """
 
     features = 512
 
     def __init__(self, size: int, mean: float, std: float, frames: int = 1):
         super().__init__()
-        if size < LARGE:
+        if size < LARGE_LAYOUT_PX:
             stream = 16
             self.first = Pixels(3 * frames, 16, 8, 4, mean, std)
             self.second = None

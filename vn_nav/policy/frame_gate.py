@@ -6,7 +6,7 @@ import math
 
 OLD, AHEAD, REORDERED, UNUSABLE = 'old stamp', 'stamp ahead', 'reordered stamp', 'unusable picture'
 CURE = 'set use_sim_time with a simulator, set both clocks by NTP, or raise'
-MAX_TEXT = 200  # characters: a hostile message must not grow the diagnostics
+MAX_TEXT_CHARACTERS = 200  # characters: a hostile message must not grow the diagnostics
 
 
 class FrameGate:
@@ -78,7 +78,7 @@ class FrameGate:
         self.last = shorten(why)
 
 
-def shorten(text: str, most: int = MAX_TEXT) -> str:
+def shorten(text: str, most: int = MAX_TEXT_CHARACTERS) -> str:
     """One line of at most so many characters."""
     text = ' '.join(str(text[:4 * most]).split())
     return text if len(text) <= most else text[:most - 1] + '…'

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import collections
 
-AGAIN_S = 5.0  # the same picture within this time of the one before is said again
-AGAIN_TIMES = 2  # and from the second repetition on it is taken as one goal
-RATE_S = 20.0  # of which a rate is counted
+REPETITION_S = 5.0  # the same picture within this time of the one before is said again
+MAX_REPETITIONS = 2  # and from the second repetition on it is taken as one goal
+RATE_WINDOW_S = 20.0  # of which a rate is counted
 
 
 class GoalWatch:
@@ -35,18 +35,18 @@ class GoalWatch:
         """
         if (stamp, picture) == self._identity:
             return False  # received twice, or latched and received again
-        soon = bool(self._heard) and now - self._heard[-1][0] <= AGAIN_S
+        soon = bool(self._heard) and now - self._heard[-1][0] <= REPETITION_S
         same = self._identity is not None and self._identity[1] == picture
         self._repeats = self._repeats + 1 if same and soon else 0
         self._identity = (stamp, picture)
-        new = self._trust_stamps or self._repeats < AGAIN_TIMES
+        new = self._trust_stamps or self._repeats < MAX_REPETITIONS
         self._heard.append((now, new))
         return new
 
     def warning(self, now: float) -> str:
         """What is wrong with how goals are published; empty: nothing."""
-        recent = [(at, new) for at, new in self._heard if now - at <= RATE_S]
-        if self._trust_stamps or len(recent) < 4 or now - recent[-1][0] > AGAIN_S:
+        recent = [(at, new) for at, new in self._heard if now - at <= RATE_WINDOW_S]
+        if self._trust_stamps or len(recent) < 4 or now - recent[-1][0] > REPETITION_S:
             return ''
         rate = (len(recent) - 1) / max(recent[-1][0] - recent[0][0], 1e-3)
         if not recent[-1][1]:

@@ -18,7 +18,7 @@ from vn_nav.policy.heads import Pose, grown
 from vn_nav.policy.memory import Feedforward, GoalTracker, MaskedLSTM, RecurrentState, stack_frames
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.network_parts import PUBLISHED, build_encoder, build_head, initialise
-from vn_nav.policy.places import WIDTH, MultiViewAveraging, PathAdvice, PlaceClassifier
+from vn_nav.policy.places import PLACE_FEATURES, MultiViewAveraging, PathAdvice, PlaceClassifier
 from vn_nav.policy.zhu import SceneLinear, Siamese
 
 # Pictures go through the encoder in parts of this size on a processor: larger float32 pixels are
@@ -85,7 +85,7 @@ class Policy(nn.Module):
         inputs = (encoder.features + len(config.actions) + 1
                   + (5 if config.pose_to_memory else 0)
                   + (GoalTracker.WIDTH if config.moves else 0)
-                  + (WIDTH if config.places else 0))
+                  + (PLACE_FEATURES if config.places else 0))
         self.tracker = GoalTracker(config.moves) if config.moves else None
         if config.frames > 1:
             self.memory = Feedforward(inputs, config.hidden)

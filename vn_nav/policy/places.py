@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from vn_nav.policy.encoders import Matching, Pixels, apply, directions, orthogonal
 
 HEADINGS = 16  # directions that are distinguished
-WIDTH = 128  # of the place features for the memory
+PLACE_FEATURES = 128  # of the place features for the memory
 
 
 class PlaceClassifier(nn.Module):
@@ -147,8 +147,8 @@ class PathAdvice(nn.Module):
     def __init__(self, width: int, actions: int):
         super().__init__()
         self.join = nn.Linear(2 * width, 512)
-        self.out = nn.Linear(512, WIDTH)
-        self.advise = nn.Linear(WIDTH, actions)
+        self.out = nn.Linear(512, PLACE_FEATURES)
+        self.advise = nn.Linear(PLACE_FEATURES, actions)
         orthogonal(self)
         nn.init.zeros_(self.advise.weight)
 

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from vn_nav.errors import UserError
 
-SIDE = 224  # pixels that the published weights were trained for
+SIDE_PX = 224  # pixels that the published weights were trained for
 # ImageNet's mean and deviation of red, green and blue, as shares of white.
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # Names in torchvision's files that a frozen encoder has no use for.
@@ -101,8 +101,8 @@ class ResNet50(nn.Module):
     def forward(self, pictures: Tensor) -> Tensor:
         """[N,3,S,S] uint8, resized to 224 pixels a side -> means of the maps [N,2048]."""
         x = pictures.float() / 255
-        if x.shape[-1] != SIDE:
-            x = F.interpolate(x, (SIDE, SIDE), mode='bilinear', align_corners=False)
+        if x.shape[-1] != SIDE_PX:
+            x = F.interpolate(x, (SIDE_PX, SIDE_PX), mode='bilinear', align_corners=False)
         x = F.relu(self.bn1(self.conv1((x - self.mean) / self.std)))
         x = F.max_pool2d(x, 3, 2, padding=1)
         for stage in (self.layer1, self.layer2, self.layer3, self.layer4):

@@ -18,7 +18,7 @@ THRESHOLDS = (0.5, 0.9)  # of success
 FULL_TAU = 0.999  # a tau from here on is 1: starts as far from the goal as in the evaluation
 HOLD_SHARE = 0.1  # of a run: how long a success has to hold on average
 CURVE_POINTS = 240  # of a curve
-SMOOTHING = 0.02  # of the axis: width of the running mean
+SMOOTHING_SHARE = 0.02  # of the axis: width of the running mean
 SEED = re.compile(r'[-_](?:seed|s)\d+$')
 
 
@@ -124,7 +124,7 @@ def average(runs: Sequence[Run], axis: str, metric: str, *, band: str = 'range',
         seeds.append((forward(x[known]), y[known], forward(x[x > 0]), run.columns['tau'][x > 0]))
     begin, end = max(u[0] for u, *_ in seeds), min(u[-1] for u, *_ in seeds)
     grid = np.linspace(begin, end, CURVE_POINTS)
-    values = np.array([_smooth(u, y, grid, SMOOTHING * (end - begin)) for u, y, *_ in seeds])
+    values = np.array([_smooth(u, y, grid, SMOOTHING_SHARE * (end - begin)) for u, y, *_ in seeds])
     taus = np.array([tau[np.clip(np.searchsorted(u, grid, side='right') - 1, 0, None)]
                      for *_, u, tau in seeds])
     mean, spread = values.mean(axis=0), values.std(axis=0)

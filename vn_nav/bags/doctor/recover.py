@@ -16,7 +16,7 @@ from vn_nav.bags.storage.records import BagError, Connection
 from vn_nav.bags.storage.stream import METADATA, Bag, load_yaml
 from vn_nav.errors import UserError
 
-MAX_QUALITY = 16 << 10  # bytes of a channel's QoS profiles that are taken over
+MAX_QOS_BYTES = 16 << 10  # bytes of a channel's QoS profiles that are taken over
 
 
 @dataclasses.dataclass
@@ -160,7 +160,7 @@ def _metadata(name: str, counts: dict[Connection, int], span: tuple[int, int], b
 def _quality(channel: Connection) -> list:
     """The QoS profiles that a channel was offered with; none where they cannot be read."""
     text = dict(channel.metadata).get('offered_qos_profiles', '')
-    if len(text) > MAX_QUALITY:
+    if len(text) > MAX_QOS_BYTES:
         return []
     try:
         profiles = load_yaml(text)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 QUANTILES = {'q01': 0.01, 'q10': 0.10, 'q50': 0.50, 'q90': 0.90, 'q99': 0.99}
-EVERY = 4  # row and column of a picture is counted
+PIXEL_STRIDE = 4  # row and column of a picture is counted
 
 Stats = dict[str, list]  # min, max, mean, std, count and `QUANTILES`; lists as JSON has them
 
@@ -30,7 +30,7 @@ class Colours:
 
     def add(self, picture: np.ndarray) -> None:
         """Count a picture [H,W,3] uint8."""
-        few = picture[::EVERY, ::EVERY].reshape(-1, 3)
+        few = picture[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, 3)
         self._counts += np.stack([np.bincount(few[:, k], minlength=256) for k in range(3)])
         self._pictures += 1
 
