@@ -223,10 +223,11 @@ def test_what_cannot_start_is_said_in_one_line(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_commands_know_it(monkeypatch, capsys):
+def test_the_commands_know_it(monkeypatch, capsys, tmp_path):
     assert cli.main(['simulators']) == 0
     assert 'thor' in capsys.readouterr().out
-    assert cli.main(['train', '--scene', 'thor:FloorPlan31', '--frames', '1']) == 2
+    assert cli.main(['train', '--scene', 'thor:FloorPlan31', '--out',
+                     str(tmp_path / 'run')]) == 2
     assert 'FloorPlan1 to 30' in capsys.readouterr().err
     from vn_sim_bridge import simulators
     monkeypatch.setattr(simulators.importlib.util, 'find_spec', lambda name: None)
