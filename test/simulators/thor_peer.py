@@ -272,7 +272,7 @@ class Peer:
         self.house.scatter(randomSeed)
 
     def do_SetObjectPoses(self, objectPoses, placeStationary=True):
-        by_name = {row['name']: row for row in objectPoses}
+        by_name = {row['objectName']: row for row in objectPoses}
         house = self.house
         house.objects = [
             Placed(item.model, row['position']['z'], -row['position']['x'],

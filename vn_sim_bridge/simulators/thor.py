@@ -180,7 +180,10 @@ class ThorSimulator(BaseSimulator):
             scene, key_then, pose = before[n]
             assert scene is not None
             agent = self.agents[n]
-            agent.load(scene) if key_then is None else agent.scatter_in(scene, key_then)
+            if key_then is None:
+                agent.load(scene)
+            else:
+                agent.scatter_in(scene, key_then)
             agent.put(pose)
         self._each(sorted(set(by)), back)
         return _stack([found[k] for k in np.argsort(order, kind='stable')])
