@@ -31,9 +31,12 @@ NEAREST = 4.0  # units: the near plane of its depth
 CEILING = 1.1  # m that a camera may stand above the floor
 SPAWNS = 8  # episodes of a level that say where it lets its player begin
 CLOSE = 0.02  # m short of what was asked that counts as a contact, along rays
-# Metres of each value of the depth picture d = 255 (1 - NEAREST / z); 255 is nothing at all.
+# Metres of each value d of the depth picture, the upper 8 bits of a z-buffer: with its far plane at
+# infinity, d = 255 (1 - NEAREST / z), rounded down. The engine puts the far plane just behind what
+# it draws, which adds 255 NEAREST / far: 1.5 in our levels, within one. 255 is nothing at all.
+BEHIND = 0.5 + 1.5
 DEPTH = np.zeros(256, np.float32)
-DEPTH[:255] = NEAREST * 255 / (255 - np.arange(255)) / UNITS
+DEPTH[:255] = NEAREST * 255 / (255 + BEHIND - np.arange(255)) / UNITS
 TEXT = Capabilities(continuous=True, depth=True, labels=False, geodesic=True, tilt=False,
                     walls=True)
 NATIVE = Capabilities(continuous=True, depth=True, labels=False, geodesic=False, tilt=False)
