@@ -293,7 +293,7 @@ def test_an_engine_does_not_grow():
 def test_ten_kills_of_engines_lose_no_training(tmp_path):
     """While `vn_nav train` runs, its engines are killed one after the other."""
     command = [sys.executable, '-m', 'vn_nav.cli', 'train', '--preset', 'fast', '--scene',
-               'dmlab:house', '--envs', '4', '--size', str(SIZE), '--frames', '12000',
+               'dmlab:house', '--envs', '4', '--size', '36', '--frames', '12000',
                '--pair-minutes', '0', '--no-tensorboard', '--out', str(tmp_path / 'run')]
     training = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                                 text=True, env=os.environ | {'OMP_NUM_THREADS': '1'})
