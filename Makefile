@@ -18,6 +18,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 READY_ALL := $(VENV)/.ready-all
 READY_DOCS := $(VENV)/.ready-docs
+READY_DMLAB := $(VENV)/.ready-dmlab
 SOURCES := setup.py examples launch test vn_msgs_py vn_nav vn_sim_bridge
 
 # A sourced ROS, or another virtual environment of ROS wheels, shadows ours with its modules,
@@ -49,7 +50,7 @@ endef
 test: $(READY)
 	$(call pytest, and not slow,--durations=5)
 
-test-all: $(READY_ALL)
+test-all: $(READY_ALL) $(READY_DMLAB)
 	$(call pytest,,--durations=20)
 
 # `make test-all` kills 20 times.
@@ -103,6 +104,13 @@ $(READY): setup.py constraints.txt
 $(READY_ALL): $(READY)
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot,miniworld,vizdoom]'
 	@PIP_CONSTRAINT=constraints.txt $(BIN)/vn_nav simulators install thor >/dev/null
+	@touch $@
+
+# DeepMind Lab, in an environment of its own, and its Debian packages where we are root. Where that
+# is not possible its tests are skipped, and say why.
+$(READY_DMLAB): $(READY) $(wildcard vn_sim_bridge/dmlab/install.py)
+	@system=$$([ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && echo --system);\
+	 $(BIN)/vn_nav simulators install dmlab $$system || echo "make goes on without DeepMind Lab" >&2
 	@touch $@
 
 $(READY_DOCS): $(READY)

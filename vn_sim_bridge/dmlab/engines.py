@@ -157,55 +157,70 @@ class Engines:
         Raises:
             UserError: one does not start.
         """
-        for n in numbers:
-            if self.engines[n] is None:
-                assert self._folder is not None  # not closed
-                own = self._folder / str(n)
-                shutil.rmtree(own, ignore_errors=True)
-                own.mkdir()
-                self.engines[n] = Engine(self.python, self._memory, self.size, own)
-        told: dict[int, int] = {}
-        n = -1
-        try:
-            for n in numbers:  # all at the same time
-                requests = self.opening(n)
-                told[n] = len(requests)
-                for request in requests:
-                    self._started(n).ask(**request)
-            for n in numbers:
-                for _ in range(told[n]):
-                    self._started(n).answer(OPENING)
-        except (Lost, ValueError) as error:
-            self._discard(n)
-            raise UserError('the engine of DeepMind Lab starts', str(error),
-                            'vn_nav simulators install dmlab, and install its Debian packages '
-                            'libsdl2-2.0-0 libosmesa6') from error
+        waiting, failed = list(numbers), dict.fromkeys(numbers, 0)
+        while waiting:
+            lost: dict[int, Lost] = {}
+            told = {n: self._begin(n, lost) for n in waiting}  # all at the same time
+            for n, count in told.items():
+                try:
+                    for _ in range(count if n not in lost else 0):
+                        self._engine(n).answer(OPENING)
+                except Lost as error:
+                    lost[n] = error
+                except ValueError as error:
+                    for each in waiting:
+                        self._discard(each)
+                    raise _unable(str(error)) from error
+            for n, error in lost.items():
+                self._discard(n)
+                self.broken[n] = True
+                failed[n] += 1
+                if failed[n] >= TRIES:
+                    raise _unable(str(error)) from error
+            waiting = list(lost)
 
-    def _started(self, n: int) -> Engine:
+    def _begin(self, n: int, lost: dict[int, Lost]) -> int:
+        """Let an engine open its level: how many answers will come."""
+        if self.engines[n] is None:
+            assert self._folder is not None  # not closed
+            own = self._folder / str(n)
+            shutil.rmtree(own, ignore_errors=True)
+            own.mkdir()
+            self.engines[n] = Engine(self.python, self._memory, self.size, own)
+        requests = self.opening(n)
+        try:
+            for request in requests:
+                self._engine(n).ask(**request)
+        except Lost as error:
+            lost[n] = error
+        return len(requests)
+
+    def _engine(self, n: int) -> Engine:
         engine = self.engines[n]
-        if engine is None:
-            self.start([n])
-            engine = self.engines[n]
-        assert engine is not None  # started, or an error
+        assert engine is not None  # it has been started
         return engine
 
+    def _started(self, n: int) -> Engine:
+        if self.engines[n] is None:
+            self.start([n])
+        return self._engine(n)
+
     def _lose(self, n: int, error: Lost) -> None:
+        """Start an engine again that has crashed or hangs."""
         self.broken[n] = True
         self.restarts += 1
-        self._discard(n)
         self._failed[n] += 1
-        for _ in range(TRIES):
-            try:
+        self._discard(n)
+        said = str(error)
+        try:
+            if self._failed[n] <= TRIES:
                 self.start([n])
-                break
-            except UserError as again:
-                error = Lost(str(again.received))
-                self._failed[n] += 1
-        if self._failed[n] > TRIES:
-            raise EnvironmentLost(
-                'an engine of DeepMind Lab that was lost starts again, and answers',
-                f'{self._failed[n]} failures in a row, the last: {error}',
-                'what was learned is kept; resume it') from error
+                return
+        except UserError as again:
+            said = str(again.received)
+        raise EnvironmentLost('an engine of DeepMind Lab that was lost starts again, and answers',
+                              f'several failures in a row, the last: {said}',
+                              'what was learned is kept; resume it') from error
 
     def _discard(self, n: int) -> None:
         engine, self.engines[n] = self.engines[n], None
@@ -220,3 +235,8 @@ class Engines:
             shutil.rmtree(self._folder, ignore_errors=True)
             os.close(self._memory)
             self._folder = None
+
+
+def _unable(said: str) -> UserError:
+    return UserError('the engine of DeepMind Lab starts', said,
+                     'vn_nav simulators install dmlab; apt install libsdl2-2.0-0 libosmesa6')

@@ -17,6 +17,7 @@ from vn_sim_bridge.floor.floor_map import FloorMap, Rect, floor_map
 from vn_sim_bridge.simulator import Goal
 
 UNITS = 50.0  # of the engine, a metre: its player then looks from 1 m above the floor
+FACE = 1.0  # units that the engine's walls stand out from their cells
 VIEW = 3.0  # m that a goal's camera sees ahead, where there is as much
 ARENA = """\
 *******
@@ -120,7 +121,7 @@ class TextPlace:
     @functools.cached_property
     def obstacles(self) -> tuple[tuple[Rect, str], ...]:
         """Walls: a rectangle for cells side by side."""
-        found = []
+        found, face = [], FACE / UNITS
         for i, row in enumerate(self.level.rows):
             low, j = (len(self.level.rows) - i - 1) * self.side, 0
             while j < len(row):
@@ -128,8 +129,8 @@ class TextPlace:
                 while end < len(row) and row[end] == '*':
                     end += 1
                 if end > j:
-                    found.append((Rect(j * self.side, low, end * self.side, low + self.side),
-                                  'wall'))
+                    found.append((Rect(j * self.side - face, low - face, end * self.side + face,
+                                       low + self.side + face), 'wall'))
                 j = max(end, j + 1)
         return tuple(found)
 

@@ -30,10 +30,12 @@ STANDING = 24.125  # units of the origin above the floor, where the engine put i
 NEAREST = 4.0  # units: the near plane of its depth
 CEILING = 1.1  # m that a camera may stand above the floor
 SPAWNS = 8  # episodes of a level that say where it lets its player begin
-CLOSE = 0.02  # m short of what was asked that counts as a contact, along rays
-# Metres of each value of the depth picture d = 255 (1 - NEAREST / z); 255 is nothing at all.
+# Metres of each value d of the depth picture, the upper 8 bits of a z-buffer: with its far plane
+# at infinity, d = 255 (1 - NEAREST / z), rounded down. The engine puts the far plane just behind
+# what it draws, which adds 255 NEAREST / far: 1.5 in our levels, within one. 255: nothing at all.
+BEHIND = 0.5 + 1.5
 DEPTH = np.zeros(256, np.float32)
-DEPTH[:255] = NEAREST * 255 / (255 - np.arange(255)) / UNITS
+DEPTH[:255] = NEAREST * 255 / (255 + BEHIND - np.arange(255)) / UNITS
 TEXT = Capabilities(continuous=True, depth=True, labels=False, geodesic=True, tilt=False,
                     walls=True)
 NATIVE = Capabilities(continuous=True, depth=True, labels=False, geodesic=False, tilt=False)
@@ -92,8 +94,8 @@ class LabSimulator(BaseSimulator):
             self.world = World(self.places, self.place_index, setup.robot.footprint_radius)
             # One array each, in the world and here: a move changes both.
             self.poses, self.place_index = self.world.poses, self.world.place_index
+        self.engines.broken[:] = False  # no episode has begun
         self._drawn = np.full((n, 4), np.nan)  # poses of the pictures in the memory
-        self._paid = np.zeros(n, np.float32)
 
     def _opening(self, n: int) -> list[dict]:
         """What opens the level of engine n and begins its episode."""

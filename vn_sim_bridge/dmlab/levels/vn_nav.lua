@@ -37,6 +37,9 @@ local LOOKS = {
     wallDecals = decals.decals,
 }
 
+local OURS = {map = 1, looks = 1, name = 1, cell = 1, apples = 1, lemons = 1, decisions = 1,
+              apple = 1, inner = 1, bsp = 1, radius = 1, seed = 1}
+
 local api, settings = {}, {}
 local free, walled, decisions, over = 0, false, 0, false
 
@@ -198,6 +201,11 @@ function api:init(given)
     level = require('factories.seek_avoid_factory').createLevelApi{
         mapName = settings.bsp, episodeLengthSeconds = 60}
   end
+  local rest = {} -- a level of the engine refuses settings that it does not know
+  for key, value in pairs(given) do
+    if not OURS[key] then rest[key] = value end
+  end
+  local told = level.init and level:init(rest)
   local start = level.start
   if level ~= own then -- every item can be picked up by an id
     local spawn, count = level.updateSpawnVars, 1000
@@ -220,7 +228,7 @@ function api:init(given)
       api[name] = function(_, ...) return part(level, ...) end
     end
   end
-  return level.init and level:init(given)
+  return told
 end
 
 return api
