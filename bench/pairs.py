@@ -26,7 +26,8 @@ from vn_nav.learning.pairs import PairConfig, look, pretrain_pairs
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS
-from vn_sim_bridge.datasets.house_pairs import PairSampler
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.datasets.view_pairs import PairSampler
 from vn_sim_bridge.houses.splits import SPLITS
 from vn_sim_bridge.render.randomisation import load_randomisation
 
@@ -71,9 +72,9 @@ def main():
 
 def train(network: dict, arguments) -> dict:
     """One encoder's figures."""
-    options = {'rooms': 5, 'size': arguments.size, 'randomisation': load_randomisation('standard')}
-    source = PairSampler(SPLITS['train'][:arguments.houses], seed=1, **options)
-    validation = PairSampler(SPLITS['validation'][:32], seed=2, **options)
+    options = {'size': arguments.size, 'randomisation': load_randomisation('standard')}
+    source = PairSampler(house_scenes(SPLITS['train'][:arguments.houses]), seed=1, **options)
+    validation = PairSampler(house_scenes(SPLITS['validation'][:32]), seed=2, **options)
     torch.manual_seed(0)
     policy = Policy(NetworkConfig(DRIVE_ACTIONS, size=arguments.size, features=512,
                                   heads=('goal_pose',), **network))

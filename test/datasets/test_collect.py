@@ -1,11 +1,14 @@
 """Collected bags: what was seen is what is read, in episodes of one place, a frame a pose."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
+from other_corridors import SHIFT, Lacking, ManyLabels, register
 from rosbags.highlevel import AnyReader
 
+from examples import corridor
 from vn_nav.bags.dataset import Wanted, load_drives
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.roles import Topics
@@ -15,8 +18,8 @@ from vn_nav.errors import UserError
 from vn_nav.learning.hindsight import Drives
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_nav.scenes import house_scenes as named
-from vn_sim_bridge.datasets.collect import REACH, VIEWS, HouseScene, collect, house_scenes, legs
-from vn_sim_bridge.datasets.house_pairs import PairSampler
+from vn_sim_bridge.datasets.collect import REACH, VIEWS, RandomViews, collect, legs, random_views
+from vn_sim_bridge.datasets.view_pairs import PairSampler
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.render.randomisation import Randomisation, load_randomisation
 from vn_sim_bridge.simulator import Capabilities
@@ -26,7 +29,7 @@ ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
 
 def record(folder, houses=(3, 4), pictures=90, randomisation=None, seed=0):
     """A bag of a few rooms."""
-    scenes = house_scenes(named(houses, 2), 36, ROBOT, randomisation or Randomisation(), seed, 1)
+    scenes = random_views(named(houses, 2), 36, ROBOT, randomisation or Randomisation(), seed, 1)
     return collect(scenes, len(houses), pictures, ROBOT, lambda topics: BagWriter(folder, topics))
 
 
@@ -42,7 +45,7 @@ def read(folder, tmp_path):
 
 def seen(pictures, house, number=0):
     """What the scene of a house shows, by itself."""
-    scene = HouseScene(house, 2, 36, ROBOT, Randomisation())
+    scene = RandomViews(*named((house,), 2), 36, ROBOT, Randomisation())
     return scene.look(number, -(-pictures // VIEWS))
 
 
@@ -84,7 +87,7 @@ def test_most_pictures_have_another_of_their_place_in_their_episode(bag, tmp_pat
 def test_labels_of_pairs_are_those_of_the_sampler(tmp_path):
     record(tmp_path / 'bag', houses=(3,), pictures=6 * VIEWS)
     pairs = Drives([read(tmp_path / 'bag', tmp_path)], ROBOT)
-    sampler = PairSampler((3,), rooms=2, size=36, robot=ROBOT)
+    sampler = PairSampler(named((3,), 2), size=36, robot=ROBOT)
     groups = sampler.draw_groups(6, VIEWS - 1)
     at = {tuple(np.round(pose, 6)): k for k, pose in enumerate(
         np.column_stack([pairs.pose[:, :2], np.cos(pairs.pose[:, 2])]))}
@@ -141,7 +144,7 @@ class Blind:
 
 
 def test_what_a_simulator_does_not_have_is_no_topic(tmp_path):
-    scene = Blind(HouseScene(3, 2, 36, ROBOT, Randomisation()))
+    scene = Blind(RandomViews('house:3?rooms=2', 36, ROBOT, Randomisation()))
     collect([scene], 1, 8, ROBOT, lambda topics: BagWriter(tmp_path / 'bag', topics))
     assert set(summary(tmp_path / 'bag')) == {'/image_raw', '/camera_info', '/odom',
                                               '/episode_end', '/scene'}
@@ -152,10 +155,64 @@ def test_too_little_to_collect_is_refused_before_anything_is_written(tmp_path):
         with pytest.raises(UserError, match='two pictures'):
             record(tmp_path / 'bag', houses, pictures)
     with pytest.raises(UserError, match='rooms'):
-        collect(house_scenes(named((3,), 99), 36, ROBOT, Randomisation(), 0, 1), 1, 8, ROBOT,
+        collect(random_views(named((3,), 99), 36, ROBOT, Randomisation(), 0, 1), 1, 8, ROBOT,
                 lambda topics: BagWriter(tmp_path / 'bag', topics))
     assert not (tmp_path / 'bag').exists()
 
 
 def test_the_doctor_finds_nothing_wrong_with_it(bag):
     assert diagnose(bag[0]).findings == []
+
+
+class Gridded(corridor.CorridorSimulator):
+    """Robots stand at a few places, along the corridor or across."""
+
+    capabilities = dataclasses.replace(corridor.CorridorSimulator.capabilities, continuous=False)
+
+    @classmethod
+    def open(cls, scenes, setup):
+        made = super().open(scenes, setup)
+        for place in made.places:
+            x, yaw = np.meshgrid(np.arange(0.5, place.length, 0.5), np.arange(4) * np.pi / 2)
+            place.starts = lambda x=x, yaw=yaw: (
+                np.column_stack([x.ravel(), 0 * x.ravel()]), yaw.ravel())
+        return made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('kind', [corridor.CorridorSimulator, Gridded, ManyLabels, Lacking])
+def test_any_simulator_is_collected_from(tmp_path, monkeypatch, kind):
+    register(monkeypatch, 'kind', kind)
+    scenes = random_views(['kind:8', 'kind:5'], 36, ROBOT, Randomisation(), 0, 1)
+    done = collect(scenes, 2, 80, ROBOT, lambda topics: BagWriter(tmp_path / 'bag', topics))
+    drives = read(tmp_path / 'bag', tmp_path)
+    assert len(drives) == done.pictures == 80
+    # On a grid the same few pictures come again and again, and the doctor wonders.
+    assert diagnose(tmp_path / 'bag').findings == [] or kind is Gridded
+    poses = drives.pose
+    assert (poses[:, 0] > 0).all() and (poses[:, 0] < 8).all() and np.ptp(poses[:, 0]) > 4
+    assert (np.abs(poses[:, 1]) < 1).all()
+    if kind is Gridded:  # nobody stands in between
+        assert not poses[:, 1].any() and np.allclose(poses[:, 0] % 0.5, 0)
+        assert np.allclose(np.sin(2 * poses[:, 2]), 0, atol=1e-6)
+    else:
+        assert len(np.unique(poses[:, 0].round(3))) > 40
+    can = kind.capabilities
+    assert (drives.depth is not None) == can.depth and (drives.labels is not None) == can.labels
+    if can.labels:
+        ids = SHIFT if kind is ManyLabels else 0
+        assert set(np.unique(drives.labels)) == {ids, ids + 1, ids + 2}
+        assert Drives([drives], ROBOT).label_names == tuple(kind.label_names)
+        assert Drives([drives], ROBOT).classes == len(kind.label_names)
+    else:
+        assert drives.facts.get('label_names', []) == []
+
+
+def test_pairs_of_a_simulator_without_walls(monkeypatch):
+    sampler = PairSampler(('examples.corridor:8',), 36, ROBOT)
+    pairs = sampler.draw(60)
+    assert 0.3 < (pairs['overlap'] >= 0.1).mean() and pairs['arrived'].any()
+    assert np.isfinite(pairs['goal_pose']).all() and pairs['segmentation'].max() == 2
+    register(monkeypatch, 'lacking', Lacking)
+    with pytest.raises(UserError, match='need a simulator with depth'):
+        PairSampler(('lacking:8',), 36, ROBOT).draw_groups(2)

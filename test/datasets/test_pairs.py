@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.datasets.house_pairs import PairSampler
+from vn_nav.scenes import house_scenes
+from vn_sim_bridge.datasets.view_pairs import PairSampler
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
@@ -18,7 +19,8 @@ from vn_sim_bridge.simulators import house as house_module
 
 @pytest.fixture(scope='module')
 def sampler():
-    return PairSampler((7, 8), rooms=3, size=36, randomisation=load_randomisation('standard'))
+    return PairSampler(house_scenes((7, 8), 3), size=36,
+                       randomisation=load_randomisation('standard'))
 
 
 def test_draws_do_not_depend_on_how_they_are_batched_and_go_on(sampler):
@@ -29,7 +31,7 @@ def test_draws_do_not_depend_on_how_they_are_batched_and_go_on(sampler):
     parts = [sampler.draw(k) for k in (5, 12, 7)]
     for name, values in whole.items():
         assert np.array_equal(values, np.concatenate([part[name] for part in parts])), name
-    other = PairSampler((7, 8), rooms=3, size=36, seed=1,
+    other = PairSampler(house_scenes((7, 8), 3), size=36, seed=1,
                         randomisation=load_randomisation('standard'))
     other.count = 17
     assert not np.array_equal(other.draw(7)['image'], parts[2]['image'])
@@ -52,7 +54,7 @@ def test_shapes_and_mixture(sampler):
     far = distance > 1.5  # and some of the goal in view: what a robot sees that enters a room
     assert (far & (pairs['overlap'] >= 0.1)).mean() > 0.12
     assert 0.05 <= pairs['arrived'].mean() <= 0.3
-    assert set(pairs['house']) == {0, 1}
+    assert set(pairs['place']) == {0, 1}
     assert (pairs['overlap'][pairs['arrived']] > 0.05).mean() > 0.9
     assert (pairs['overlap'] >= 0).all() and (pairs['overlap'] <= 1).all()
     with pytest.raises(UserError, match='at least one pair'):
@@ -101,7 +103,7 @@ def test_groups_share_a_goal_and_their_labels_are_those_of_the_environment(sampl
 
 def test_robots_stand_where_robots_can_stand(sampler):
     house, poses, goal_poses = sampler.poses(np.arange(400))
-    for index, built in enumerate(sampler.houses):
+    for index, built in enumerate(sampler.places):
         for pose in np.concatenate([poses[house == index], goal_poses[house == index]]):
             gap = np.maximum(np.maximum(built.obstacle_rects[:, :2] - pose[:2],
                                         pose[:2] - built.obstacle_rects[:, 2:]), 0)
@@ -112,14 +114,14 @@ def test_arrival_is_the_tasks_own(sampler):
     house, poses, goal_poses = sampler.poses(np.arange(1500))
     found = sampler.arrived(house, poses, goal_poses)
     expected = [
-        arrived(sampler.houses[h].geodesic(*goal[:2]).at(pose[None, :2])[0],
+        arrived(sampler.places[h].geodesic(*goal[:2]).at(pose[None, :2])[0],
                 heading_error(pose[2], goal[2]))
         for h, pose, goal in zip(house, poses, goal_poses, strict=True)]
     assert np.array_equal(found, expected) and found.sum() > 80
 
 
 def test_labels_and_pictures_are_those_of_the_environment(monkeypatch):
-    sampler = PairSampler((7,), rooms=3, size=36)
+    sampler = PairSampler(house_scenes((7,), 3), size=36)
     pairs = sampler.draw(24)
     goals = tuple(Goal(tuple(pose), 'kitchen') for pose in pairs['goal_place'])
     house = dataclasses.replace(generate_house(7, rooms=3), goals=goals)

@@ -196,6 +196,15 @@ def test_fast_learns_what_there_is(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+def test_picture_pairs_are_of_the_simulator_that_is_trained_in(tmp_path, capsys):
+    assert train('examples.corridor:5', tmp_path / 'run', '--pair-minutes', '0.02',
+                 preset='fast') == 0
+    told = capsys.readouterr().out
+    assert 'picture pairs are of the training scenes: examples.corridor has no splits' in told
+    assert 'pairs ' in told and 'bearing' in told
+
+
+@pytest.mark.slow
 def test_a_policy_of_varying_light_is_measured_where_light_does_not_vary(tmp_path, capsys):
     save_checkpoint(tmp_path / 'checkpoint', network(dataclasses.replace(
         THESIS, actions=('forward', 'backward', 'rotate_left', 'rotate_right'))), {

@@ -330,6 +330,9 @@ def test_the_commands_train_and_measure_it(dump, tmp_path, capsys):
                      '--size', '36', '--frozen-weights', 'scene', '--out',
                      str(tmp_path / 'no')]) == 2
     assert 'resnet_feature' in capsys.readouterr().err
+    assert cli.main(['collect', '--scene', name, '--pictures', '40', '--size', '36', '--out',
+                     str(tmp_path / 'bag')]) == 0
+    assert '40 pictures' in capsys.readouterr().out
     # The heads of this preset that need depth and labels are left out, with a line each.
     assert cli.main(['train', '--preset', 'fast', '--scene', name, '--frames', '3000', '--size',
                      '36', '--envs', '8', '--set', 'pair_minutes=0', '--no-tensorboard', '--out',

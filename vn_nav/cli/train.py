@@ -1,4 +1,4 @@
-"""`vn_nav train`: a policy by reinforcement, in houses or behind ROS topics."""
+"""`vn_nav train`: a policy by reinforcement, in a simulator or behind ROS topics."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import argparse
 import contextlib
 import datetime
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from vn_nav.cli.options import command_words, parse_changes
-from vn_nav.cli.scenes import training_scenes
+from vn_nav.cli.scenes import split_scenes, training_scenes
 from vn_nav.cli.world import add_world, check_backend, machine, make_env
 from vn_nav.errors import UserError
 from vn_nav.learning.left_out import ALWAYS, config_without
@@ -18,8 +19,9 @@ from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.learning.pretrain_job import load_bags, print_line
 from vn_nav.learning.trainer import train
 from vn_nav.robot import DRIVE_ACTIONS
-from vn_nav.scenes import ROOMS
+from vn_nav.scenes import one_simulator
 
+VALIDATION_SCENES = 16  # that picture pairs are judged by
 # Options that are numbers of `TrainConfig`, with their words.
 NUMBERS = {
     'frames': (float, 'agent decisions; schedules end here'),
@@ -36,9 +38,9 @@ NUMBERS = {
     'blocks': (int, 'residual blocks a stage'),
     'frozen_weights': (str, "of icra2017: file with ResNet-50's weights (torchvision's "
                        'names); scene: the features in the files of grid scenes'),
-    'scenes': (int, 'of icra2017: houses with layers of their own'),
+    'scenes': (int, 'of icra2017: scenes with layers of their own'),
     'pair_minutes': (float, 'pre-train the encoder on picture pairs for so long first'),
-    'pair_houses': (int, 'draw pairs from the first so many training houses'),
+    'pair_houses': (int, 'draw pairs from the first so many scenes of the split train'),
     'bag_share': (float, 'with --bags: steps of drives for each step of a rollout'),
     'threads': (int, 'of torch and of the renderer'),
     'device': (str, 'where network and simulator run: cpu, or a GPU such as cuda:0'),
@@ -68,8 +70,9 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--resume', action='store_true', help='go on with the run in --out')
     parser.add_argument('--init', type=Path, metavar='CHECKPOINT',
                         help='begin with the weights of a checkpoint')
-    parser.add_argument('--env', choices=('house', 'ros'), default='house',
-                        help='where: embedded houses, or robots behind ROS topics')
+    parser.add_argument('--env', choices=('sim', 'house', 'ros'), default='sim',
+                        help='where: in a simulator (house is an old word for it), or robots '
+                        'behind ROS topics')
     parser.add_argument('--lock-step', action='store_true',
                         help='with --env ros: the robot is sim_bridge_node with time:=lock_step')
     parser.add_argument('--namespaces', nargs='+', metavar='NAME',
@@ -87,7 +90,7 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--goal-variants', type=int,
                         help="differently lit pictures of each goal; default: the randomisation's")
     parser.add_argument('--task', default='image', help='image, object, room or collect')
-    parser.add_argument('--objects', type=int, default=1, help='in the house at a time')
+    parser.add_argument('--objects', type=int, default=1, help='in the place at a time')
     parser.add_argument('--actions', default=','.join(DRIVE_ACTIONS),
                         help="names from the robot's table, with commas between")
     parser.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
@@ -178,7 +181,7 @@ def run(args: argparse.Namespace) -> int:
         'task': args.task, 'objects': args.objects}
     pairs = None
     if config.pair_minutes and not args.init:
-        pairs = _pair_sources(args, config)
+        pairs = _pair_sources(args, config, scenes)
     with contextlib.closing(env):
         print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
                     pairs=pairs, bags=bags))
@@ -252,16 +255,27 @@ def _over_ros(args: argparse.Namespace) -> int:
     return 0
 
 
-def _pair_sources(args: argparse.Namespace, config):
-    """Makes the pairs that a training begins with, and those of validation houses."""
+def _pair_sources(args: argparse.Namespace, config, scenes: Sequence[str]):
+    """Makes the pairs that a training begins with, and those to judge by.
+
+    Of the splits train and validation where the simulator has them, else of the training's scenes.
+    """
     def make():
         from vn_nav.robot import load_robot
-        from vn_sim_bridge.datasets.house_pairs import PairSampler
-        from vn_sim_bridge.houses.splits import SPLITS
+        from vn_sim_bridge.datasets.view_pairs import PairSampler
         from vn_sim_bridge.render.randomisation import load_randomisation
-        options = {'rooms': args.rooms or ROOMS, 'size': args.size, 'threads': config.threads,
+        from vn_sim_bridge.simulators import simulator_class
+        simulator, _ = one_simulator(scenes)
+        own = others = scenes
+        if {'train', 'validation'} <= set(simulator_class(simulator).splits):
+            own, others = (split_scenes(simulator, split, count, args.rooms) for split, count in (
+                ('train', config.pair_houses), ('validation', VALIDATION_SCENES)))
+        else:
+            print(f'picture pairs are of the training scenes: {simulator} has no splits train and '
+                  'validation', flush=True)
+        options = {'size': args.size, 'threads': config.threads,
                    'robot': load_robot(args.robot) if args.robot else None,
                    'randomisation': load_randomisation(args.randomisation)}
-        return (PairSampler(SPLITS['train'][:config.pair_houses], seed=args.seed, **options),
-                PairSampler(SPLITS['validation'][:16], seed=args.seed + 1, **options))
+        return (PairSampler(own, seed=args.seed, **options),
+                PairSampler(others, seed=args.seed + 1, **options))
     return make

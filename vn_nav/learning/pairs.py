@@ -34,7 +34,7 @@ COLUMNS = ('pairs', 'minutes', 'loss', 'bearing_deg', 'bearing_within_30', 'head
 
 
 class PairSource(Protocol):
-    """Draws pairs; `vn_sim_bridge.datasets.house_pairs.PairSampler` does."""
+    """Draws pairs; `vn_sim_bridge.datasets.view_pairs.PairSampler` does."""
 
     count: int  # robots placed so far; may be set
 

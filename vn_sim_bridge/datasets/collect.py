@@ -7,6 +7,7 @@ group are a pair to learn from. A group is an episode of the bag, or several whe
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -23,14 +24,13 @@ from vn_msgs_py.motion import yaw_to_quaternion
 from vn_msgs_py.topics import Topic, topic
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
-from vn_nav.scenes import HOUSE, parse_scene
+from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream, key
-from vn_sim_bridge.datasets.house_pairs import PairSampler
-from vn_sim_bridge.houses.labels import LABELS
+from vn_sim_bridge.datasets.view_pairs import PairSampler
+from vn_sim_bridge.floor.places import with_rooms
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.simulator import Frames, Simulator
-from vn_sim_bridge.simulators.house import HouseSimulator, open_houses
 
 VIEWS = 8  # pictures of a group
 GROUPS = 8  # that are drawn at a time
@@ -45,7 +45,7 @@ OPTICAL_FRAME = 'camera_optical_frame'
 
 
 class Scene(Protocol):
-    """A place to take pictures in; `HouseScene` is that of the embedded houses."""
+    """A place to take pictures in; `RandomViews` is that of a simulator's scenes."""
 
     facts: dict  # for the topic `scene`, JSON
 
@@ -68,34 +68,36 @@ class Writer(Protocol):
         """Append a message; the stamp is in ns since 1970."""
 
 
-class HouseScene:
-    """One embedded house, and robots in it.
+class RandomViews:
+    """Pictures of one scene of a simulator from random poses.
 
     Light, camera and noise are drawn anew for each picture, as a goal picture differs from what
     the robot sees of its place.
 
     Args:
-        seed: of the house; rooms: of it.
+        scene: its name.
         size: side of the pictures [pixels].
         robot: footprint and camera.
         randomisation: of light and camera.
         draws: seed of poses and light.
         threads: threads that draw.
+
+    Raises:
+        UserError: no such scene, or a simulator that cannot look from anywhere.
     """
 
-    label_names = LABELS
-
-    def __init__(self, seed: int, rooms: int, size: int, robot: RobotSpec,
+    def __init__(self, scene: str, size: int, robot: RobotSpec,
                  randomisation: Randomisation, draws: int = 0, threads: int = 1):
-        self._sampler = PairSampler((seed,), rooms=rooms, size=size, robot=robot, seed=draws)
+        self._sampler = PairSampler((scene,), size=size, robot=robot, seed=draws,
+                                    randomisation=randomisation, threads=threads)
         self._draws = draws
-        house, = self._sampler.houses
-        self.simulator = HouseSimulator([house], np.zeros(GROUPS * VIEWS, np.int64), robot=robot,
-                                        size=size, threads=threads, randomisation=randomisation)
+        self.simulator, (place,) = self._sampler.simulator, self._sampler.places
+        can = self.simulator.capabilities
+        self.label_names = self.simulator.label_names if can.labels else ()
         self.facts = {
-            'simulator': HOUSE, 'world_version': self.simulator.version,
-            'rooms': len(house.rooms),
-            **house.plan(),
+            'simulator': parse_scene(scene).simulator, 'world_version': self.simulator.version,
+            **({'rooms': len(with_rooms(place).rooms)} if can.rooms else {}),
+            **(place.plan() or {'scene': place.name}),
             'arrival': {'radius': tasks.ARRIVAL_RADIUS,
                         'heading_deg': math.degrees(tasks.ARRIVAL_HEADING)},
             'camera_fov_deg': math.degrees(robot.camera_fov)}
@@ -108,28 +110,27 @@ class HouseScene:
         poses = np.concatenate([places[::around, None], poses.reshape(groups, around, 4)], 1)
         poses = poses.reshape(-1, 4)
         views = number * VIEWS + np.arange(groups * VIEWS)
-        robots = np.arange(groups * VIEWS)
-        self.simulator.place(robots, poses)
-        self.simulator.apply_appearance(robots, self._draws, Stream.PAIR_APPEARANCE, views,
-                                        COLLECTED)
-        return poses, self.simulator.observe(
-            robots, key(self._draws, Stream.PAIR_SENSOR, views, COLLECTED))
+        looks = self.simulator.appearance(self._draws, Stream.PAIR_APPEARANCE, views, COLLECTED)
+        return poses, self.simulator.view(
+            np.zeros(len(poses), np.int64), poses, None, looks,
+            key(self._draws, Stream.PAIR_SENSOR, views, COLLECTED))
+
+    def close(self) -> None:
+        """Let go of the simulator."""
+        self.simulator.close()
 
 
-def house_scenes(scenes: Iterable[str], size: int, robot: RobotSpec,
-                 randomisation: Randomisation, seed: int, threads: int) -> Iterator[HouseScene]:
-    """What is seen in some scenes, by their names, made one at a time.
+def random_views(scenes: Iterable[str], size: int, robot: RobotSpec, randomisation: Randomisation,
+                 seed: int, threads: int) -> Iterator[RandomViews]:
+    """What is seen in some scenes, by their names, made and closed one at a time.
 
     Raises:
-        UserError: a scene that is no house.
+        UserError: a scene that there is not.
     """
     for scene in scenes:
-        parts = parse_scene(scene)
-        if parts.simulator != HOUSE:
-            raise UserError('pictures are collected in embedded houses', scene,
-                            'name houses, as in house:7')
-        house, = open_houses([parts])
-        yield HouseScene(house.seed, len(house.rooms), size, robot, randomisation, seed, threads)
+        with contextlib.closing(RandomViews(scene, size, robot, randomisation, seed,
+                                            threads)) as views:
+            yield views
 
 
 class Collected(NamedTuple):

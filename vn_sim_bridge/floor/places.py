@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vn_sim_bridge.houses.house import Room
 
 
+@runtime_checkable
 class FloorPlace(Place, Protocol):
     """A place with a floor map."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import cv2
 import numba
 import numpy as np
 
@@ -14,11 +15,11 @@ from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import CELL, FloorMap
-from vn_sim_bridge.houses.procedural import generate_house
+from vn_sim_bridge.floor.places import FloorPlace, WalledPlace
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.render.randomisation import Randomisation
-from vn_sim_bridge.simulator import Frames
-from vn_sim_bridge.simulators.house import HouseSimulator
+from vn_sim_bridge.simulator import Frames, Place, Setup
+from vn_sim_bridge.simulators import open_simulator, robot_for
 
 # How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.
 NEARBY = (0.30, 4.0, math.radians(75))
@@ -33,44 +34,58 @@ WINDOW = 12  # cells around a goal that a path of the arrival radius cannot leav
 
 
 class PairSampler:
-    """Independent random pairs of views in some houses.
+    """Independent random pairs of views in some scenes.
 
     A goal stands on a random free cell, with free floor straight ahead. A robot stands near it
-    (`NEARBY`, `CLOSE`, `BEHIND`: where it touches nothing) or anywhere in its house. Light and
+    (`NEARBY`, `CLOSE`, `BEHIND`: where it touches nothing) or anywhere in its place. Light and
     camera of the two are drawn apart. Everything is a function of the seed and the number of the
     draw: to go on later, keep `count` and set it again.
 
     Args:
-        houses: seeds.
-        rooms: of each house.
+        scenes: names, all of one simulator.
         size: side of the pictures [pixels].
-        robot: footprint and camera; the standard robot if left out.
+        robot: footprint and camera; the scenes' own if left out.
         randomisation: of light and camera; default: nothing varies.
         seed: of the draws.
         threads: threads that draw.
+
+    Raises:
+        UserError: no scene, or a simulator that cannot look from anywhere.
     """
 
-    def __init__(self, houses: Sequence[int], rooms: int = 5, size: int = 84,
-                 robot: RobotSpec | None = None, randomisation: Randomisation | None = None,
-                 seed: int = 0, threads: int = 1):
-        if len(houses) < 1:
-            raise UserError('there is at least one house', houses, 'name their seeds')
-        self.houses = [generate_house(house, rooms=rooms) for house in houses]
+    def __init__(self, scenes: Sequence[str], size: int = 84, robot: RobotSpec | None = None,
+                 randomisation: Randomisation | None = None, seed: int = 0, threads: int = 1):
+        if len(scenes) < 1:
+            raise UserError('there is at least one scene', scenes, 'name some')
         self.count = 0  # pairs drawn so far
         self._seed, self._size = seed, size
-        self._simulator = HouseSimulator(self.houses, [0], robot=robot or RobotSpec(), size=size,
-                                         threads=threads, randomisation=randomisation)
-        cells = [house.floor.centres() for house in self.houses]
-        maps = [house.floor.free for house in self.houses]
+        self.robot = robot_for(scenes, robot)
+        self.simulator = open_simulator(scenes, Setup(1, self.robot, size, threads,
+                                                      randomisation))
+        self.places = list(self.simulator.places)
+        can = self.simulator.capabilities
+        if not can.teleport:
+            self.simulator.close()
+            raise UserError('random poses need a simulator that puts robots anywhere',
+                            scenes[0], 'choose another simulator (vn_nav simulators)')
+        if randomisation is not None and randomisation.varies_pictures and not can.appearance:
+            self.simulator.close()
+            raise UserError('light and camera vary in simulators that draw them',
+                            'a randomisation', 'leave it out, or choose another simulator')
+        # On a grid robots stand where episodes may begin, and nowhere else.
+        self._stands = None if can.continuous else [place.starts() for place in self.places]
+        floors = list(map(standing_room, self.places))
+        cells = [floor.centres() for floor in floors]
+        maps = [floor.free for floor in floors]
         free = np.zeros((len(maps), *np.max([part.shape for part in maps], axis=0)), bool)
         for part, own in zip(free, maps, strict=True):
             part[:own.shape[0], :own.shape[1]] = own
-        rects = [house.obstacle_rects for house in self.houses]
+        rects = [place.obstacle_rects if isinstance(place, WalledPlace) else np.zeros((0, 4))
+                 for place in self.places]
         self._floors = (
             np.concatenate(cells), np.cumsum([0, *map(len, cells)]),
             np.concatenate(rects), np.cumsum([0, *map(len, rects)]), free,
-            np.array([house.floor.origin for house in self.houses]),
-            self._simulator.robot.footprint_radius)
+            np.array([floor.origin for floor in floors]), self.robot.footprint_radius)
 
     def draw(self, count: int) -> dict[str, np.ndarray]:
         """The next pairs.
@@ -83,24 +98,25 @@ class PairSampler:
             goal_pose: [K,4] float32, see `co_visibility.relative_pose`.
             overlap: [K] float32, see `co_visibility.co_visible`.
             arrived: [K] bool, by the image task's rule.
-            depth: [K,S,S] float32 m; segmentation, goal_segmentation: [K,S,S] uint8.
-            house: [K] int64, index; pose, goal_place: [K,4] float64 in the map frame.
+            depth: [K,S,S] float32 m; segmentation, goal_segmentation: [K,S,S] class ids.
+            place: [K] int64, index; pose, goal_place: [K,4] float64 in the map frame.
         """
         if count < 1:
             raise UserError('a draw has at least one pair', count, 'draw more')
+        self._need_depth()
         numbers = np.arange(self.count, self.count + count)
-        house, poses, goal_poses = self.poses(numbers)
+        place, poses, goal_poses = self.poses(numbers)
         self.count += count
-        goal, goal_camera = self._look(house, goal_poses, numbers, 1)
+        goal, goal_camera = self._look(place, goal_poses, numbers, 1)
         points = lift(goal.depth, *goal_camera)
-        image, camera = self._look(house, poses, numbers, 0)
+        image, camera = self._look(place, poses, numbers, 0)
         return {
             'image': image.rgb, 'goal': goal.rgb,
             'goal_pose': relative_pose(poses, goal_poses),
             'overlap': co_visible(points, image.depth, *camera),
-            'arrived': self.arrived(house, poses, goal_poses),
+            'arrived': self.arrived(place, poses, goal_poses),
             'depth': image.depth, 'segmentation': image.labels, 'goal_segmentation': goal.labels,
-            'house': house, 'pose': poses, 'goal_place': goal_poses,
+            'place': place, 'pose': poses, 'goal_place': goal_poses,
         }
 
     def draw_groups(self, count: int, robots: int = 3) -> dict[str, np.ndarray]:
@@ -113,7 +129,7 @@ class PairSampler:
 
         Returns:
             image: [V,3,S,S] uint8 of V = count * (1 + R) views, a goal before its robots.
-            depth: [V,S,S] float32 m; segmentation: [V,S,S] uint8.
+            depth: [V,S,S] float32 m; segmentation: [V,S,S] class ids.
             first, second: [K] int64, views of the K = count * (1 + R) * R pairs; the second is
                 the goal.
             goal_pose: [K,4], overlap: [K], of the pairs, as `draw` returns them.
@@ -121,16 +137,17 @@ class PairSampler:
         if count < 1 or robots < 1:
             raise UserError('a draw has at least one group, and that one robot', (count, robots),
                             'draw more')
+        self._need_depth()
         # The numbers of the draws go on over all robots, whatever a group's size.
         numbers = np.arange(self.count, self.count + count * robots)
-        house, poses, goal_poses = self.poses(numbers, robots)
+        place, poses, goal_poses = self.poses(numbers, robots)
         self.count += count * robots
         size = 1 + robots
         poses = np.concatenate([goal_poses[::robots, None], poses.reshape(count, robots, 4)], 1)
         numbers = np.concatenate([numbers[::robots, None], numbers.reshape(count, robots)], 1)
         views = np.tile(np.arange(size) == 0, count)  # as in `draw`: a goal is 1, a robot 0
         poses, numbers = poses.reshape(-1, 4), numbers.reshape(-1)
-        frames, (cameras, fov) = self._look(np.repeat(house[::robots], size), poses, numbers,
+        frames, (cameras, fov) = self._look(np.repeat(place[::robots], size), poses, numbers,
                                             views.astype(np.int64))
         points = lift(frames.depth, cameras, fov)
         first, second = np.nonzero(~np.eye(size, dtype=bool))
@@ -145,19 +162,33 @@ class PairSampler:
 
     def poses(self, numbers: np.ndarray, robots: int = 1
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Houses [K] and poses [K,4] of robots and of goals, of some draws [K].
+        """Places [K] and poses [K,4] of robots and of goals, of some draws [K].
 
         With several `robots` as many rows in a row have the goal of their first one.
         """
         draws = uniform(self._seed, Stream.PAIR, numbers[:, None], 0, np.arange(3 + 5 * TRIES))
         leader = np.arange(len(numbers)) // robots * robots
         draws[:, 0], draws[:, 3:3 + 2 * TRIES] = draws[leader, 0], draws[leader, 3:3 + 2 * TRIES]
-        house = (draws[:, 0] * len(self.houses)).astype(np.int64)
+        place = (draws[:, 0] * len(self.places)).astype(np.int64)
         poses, goal_poses = np.zeros((2, len(numbers), 4))
-        _place(draws, house, *self._floors, poses, goal_poses)
-        return house, poses, goal_poses
+        _place(draws, place, *self._floors, poses, goal_poses)
+        if self._stands is not None:
+            for k, index in enumerate(place):
+                for pose in (poses[k], goal_poses[k]):
+                    _stand(pose, *self._stands[index])
+        return place, poses, goal_poses
 
-    def arrived(self, house: np.ndarray, poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
+    def _need_depth(self) -> None:
+        """Without depth nobody knows what two pictures share.
+
+        Raises:
+            UserError: there is none.
+        """
+        if not self.simulator.capabilities.depth:
+            raise UserError('picture pairs need a simulator with depth', self.places[0].name,
+                            'leave them out (pair_minutes=0), or choose another simulator')
+
+    def arrived(self, place: np.ndarray, poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
         """Whether robots [K,4] have arrived at goals [K,4], by the image task's rule, [K] bool.
 
         The geodesic distance is the task's own, solved in a window around each goal that holds
@@ -168,7 +199,11 @@ class PairSampler:
         distance = np.hypot(gap[:, 0], gap[:, 1])
         # Solved distances fall short of straight ones by no more than a cell.
         for k in np.nonzero(tasks.arrived(distance - CELL, error))[0]:
-            floor = self.houses[house[k]].floor
+            own = self.places[place[k]]
+            if not isinstance(own, FloorPlace):
+                distance[k] = tasks.distance_to(own, *goal_poses[k, :2]).at(poses[k:k + 1])[0]
+                continue
+            floor = own.floor
             column, row = ((goal_poses[k, :2] - floor.origin) / CELL).astype(int)
             left, low = max(column - WINDOW, 0), max(row - WINDOW, 0)
             window = FloorMap(
@@ -178,24 +213,53 @@ class PairSampler:
             distance[k] = field.at(poses[k:k + 1, :2])[0]
         return tasks.arrived(distance, error)
 
-    def _look(self, house, poses, numbers, view: int | np.ndarray
+    def _look(self, place, poses, numbers, view: int | np.ndarray
               ) -> tuple[Frames, tuple]:
         """Pictures from poses, and the cameras that took them; `view` tells the two apart."""
-        appearance = self._simulator.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
-        frames = self._simulator.view(house, poses, None, appearance,
-                                      key(self._seed, Stream.PAIR_SENSOR, numbers, view))
-        return frames, self._simulator.cameras(poses, appearance)
+        appearance = self.simulator.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
+        frames = self.simulator.view(place, poses, None, appearance,
+                                     key(self._seed, Stream.PAIR_SENSOR, numbers, view))
+        return frames, self.simulator.cameras(poses, appearance)
+
+
+def standing_room(place: Place) -> FloorMap:
+    """Where in a place a robot can stand: its floor map, or what lies about its starts."""
+    if isinstance(place, FloorPlace):
+        return place.floor
+    cells, _ = place.starts()
+    some = cells[np.linspace(0, len(cells) - 1, min(len(cells), 200)).astype(int)]
+    gaps = np.hypot(*(some[:, None] - cells[None]).transpose(2, 0, 1))
+    apart = float(np.median(np.where(gaps > 1e-6, gaps, np.inf).min(axis=1)))
+    about = apart / 2 if math.isfinite(apart) else 0.0
+    low = cells.min(axis=0) - about - CELL
+    size = np.ceil((cells.max(axis=0) + about + CELL - low) / CELL).astype(int)
+    far = np.ones(size[::-1], np.uint8)
+    column, row = np.floor((cells - low) / CELL).astype(int).T
+    far[row, column] = 0
+    off = cv2.distanceTransform(far, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL
+    return FloorMap((float(low[0]), float(low[1])), off <= about)
+
+
+def _stand(pose: np.ndarray, cells: np.ndarray, headings: np.ndarray | None) -> None:
+    """Move a pose [4] to the nearest cell where a robot may stand, and to a heading there."""
+    gap = np.hypot(*(cells - pose[:2]).T)
+    near = np.flatnonzero(gap <= gap.min() + 1e-6)
+    best = near[0]
+    if headings is not None:
+        best = near[np.argmin(tasks.heading_error(headings[near], pose[2]))]
+        pose[2] = headings[best]
+    pose[:2] = cells[best]
 
 
 @numba.njit(cache=True)
-def _fits(x, y, house, rects, first_rect, free, origins, radius):
+def _fits(x, y, place, rects, first_rect, free, origins, radius):
     """Whether a robot can stand, and get, there."""
-    column = math.floor((x - origins[house, 0]) / CELL)
-    row = math.floor((y - origins[house, 1]) / CELL)
+    column = math.floor((x - origins[place, 0]) / CELL)
+    row = math.floor((y - origins[place, 1]) / CELL)
     if not (0 <= row < free.shape[1] and 0 <= column < free.shape[2]
-            and free[house, int(row), int(column)]):
+            and free[place, int(row), int(column)]):
         return False
-    for m in range(first_rect[house], first_rect[house + 1]):
+    for m in range(first_rect[place], first_rect[place + 1]):
         dx = max(max(rects[m, 0] - x, x - rects[m, 2]), 0.0)
         dy = max(max(rects[m, 1] - y, y - rects[m, 3]), 0.0)
         if dx * dx + dy * dy < radius * radius:
@@ -204,12 +268,12 @@ def _fits(x, y, house, rects, first_rect, free, origins, radius):
 
 
 @numba.njit(cache=True)
-def _place(draws, houses, cells, first_cell, rects, first_rect, free, origins, radius, poses,
+def _place(draws, places, cells, first_cell, rects, first_rect, free, origins, radius, poses,
            goal_poses):
     """Stand goals and robots up, by uniform numbers [K,3+5*TRIES]."""
-    for k in range(len(houses)):
-        house = houses[k]
-        low, count = first_cell[house], first_cell[house + 1] - first_cell[house]
+    for k in range(len(places)):
+        place = places[k]
+        low, count = first_cell[place], first_cell[place + 1] - first_cell[place]
         rest = draws[k, 3:]
         goal = goal_poses[k]
         for attempt in range(TRIES):
@@ -220,7 +284,7 @@ def _place(draws, houses, cells, first_cell, rects, first_rect, free, origins, r
             clear = True
             for step in range(1, 6):
                 reach = GOAL_CLEARANCE * step / 5
-                if not _fits(goal[0] + c * reach, goal[1] + s * reach, house, rects, first_rect,
+                if not _fits(goal[0] + c * reach, goal[1] + s * reach, place, rects, first_rect,
                              free, origins, 0.0):
                     clear = False
                     break
@@ -236,7 +300,7 @@ def _place(draws, houses, cells, first_cell, rects, first_rect, free, origins, r
                 cell = low + int(rest[3 * attempt] * count)
                 pose[0] = cells[cell, 0] + (rest[3 * attempt + 1] - 0.5) * CELL
                 pose[1] = cells[cell, 1] + (rest[3 * attempt + 2] - 0.5) * CELL
-                if _fits(pose[0], pose[1], house, rects, first_rect, free, origins, radius):
+                if _fits(pose[0], pose[1], place, rects, first_rect, free, origins, radius):
                     break
             pose[2] = (2 * draws[k, 2] - 1) * math.pi
             continue
@@ -251,7 +315,7 @@ def _place(draws, houses, cells, first_cell, rects, first_rect, free, origins, r
                 distance = farthest * math.sqrt(rest[3 * attempt])  # more of the far ones
                 angle = goal[2] + math.pi + BEHIND[3] * (angle / math.pi - 1)
             x, y = goal[0] + distance * math.cos(angle), goal[1] + distance * math.sin(angle)
-            if _fits(x, y, house, rects, first_rect, free, origins, radius):
+            if _fits(x, y, place, rects, first_rect, free, origins, radius):
                 pose[0], pose[1] = x, y
                 break
         yaw = goal[2]
