@@ -330,6 +330,9 @@ def test_the_commands_train_and_measure_it(dump, tmp_path, capsys):
                      '--size', '36', '--frozen-weights', 'scene', '--out',
                      str(tmp_path / 'no')]) == 2
     assert 'resnet_feature' in capsys.readouterr().err
+    assert cli.main(['collect', '--scene', name, '--pictures', '40', '--size', '36', '--out',
+                     str(tmp_path / 'bag')]) == 0
+    assert '40 pictures' in capsys.readouterr().out
     # The heads of this preset that need depth and labels are left out, with a line each.
     assert cli.main(['train', '--preset', 'fast', '--scene', name, '--frames', '3000', '--size',
                      '36', '--envs', '8', '--set', 'pair_minutes=0', '--no-tensorboard', '--out',
@@ -359,6 +362,63 @@ def test_a_robot_drives_over_the_grid_by_velocities(dump):
         assert np.allclose(np.sin((driven.pose - poses[state]) / 2), 0, atol=1e-6)
         assert np.array_equal(driven.simulator.observe().rgb[0], place.scene.rgb[state])
     driven.close()
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_the_bridge_drives_over_the_grid(dump, tmp_path):
+    """By Twist, at the speed of the robot: a cell ahead, and then a contact at the wall."""
+    from ros_harness import child, wait_until
+    rclpy = pytest.importorskip('rclpy')
+    from geometry_msgs.msg import Twist
+    from nav_msgs.msg import Odometry
+    from rclpy.executors import SingleThreadedExecutor
+    from sensor_msgs.msg import Image
+    from std_msgs.msg import String
+
+    from vn_nav.nodes.qos import qos
+    rclpy.init()
+    node, heard = rclpy.create_node('grid_test'), {}
+    try:
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        for name, kind in (('scene', String), ('image_raw', Image), ('goal_image', Image),
+                           ('ground_truth/odom', Odometry)):
+            heard[name] = []
+            node.create_subscription(kind, name, heard[name].append, qos(name, depth=10))
+        command = node.create_publisher(Twist, 'cmd_vel', qos('cmd_vel'))
+
+        def spin():
+            executor.spin_once(timeout_sec=0.02)
+        with child('vn_sim_bridge.bridge_node', tmp_path / 'log', scene=scene(dump[0]), size=24):
+            wait_until(lambda: all(heard.values()), spin)
+            facts = json.loads(heard['scene'][0].data)
+            assert facts['simulator'] == 'grid' and len(facts['goals']) == 3
+            poses = grid(dump[0]).poses
+            odom = heard['ground_truth/odom']
+            odom_queue = len(odom)
+            wait_until(lambda: command.get_subscription_count() > 0, spin)
+
+            def at(message):
+                return message.pose.pose.position.x, message.pose.pose.position.y
+            for speed in (0.2, -0.2):  # to the end of the row, and back to the other
+                twist = Twist()
+                twist.linear.x = speed
+                begun = len(odom)
+
+                def stands(twist=twist, begun=begun):
+                    command.publish(twist)
+                    spin()
+                    return len(odom) > begun + 60 and at(odom[-1]) == at(odom[-20])
+                wait_until(stands, lambda: None)
+            places = np.array([at(message) for message in odom[odom_queue:]])
+            gap = np.hypot(*(poses[:, None, :2] - places[None]).transpose(2, 0, 1))
+            assert np.ptp(places, axis=0).max() >= 0.5 - 1e-6  # from cell to cell
+            assert np.ptp(places, axis=0).min() < 1e-6  # along one axis
+            assert gap.min(axis=0).max() <= 0.25 + 1e-6 and gap[:, -1].min() < 1e-6
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 @pytest.mark.slow
@@ -401,3 +461,24 @@ def test_a_dumped_house_is_the_house(tmp_path, capsys):
     assert (cells >= floor - 0.3).all()
     read.close()
     original.close()
+
+
+def test_any_place_where_robots_can_be_put_is_dumped(dump, tmp_path, capsys):
+    path = tmp_path / 'corridor.h5'
+    assert cli.main(['simulators', 'dump', 'examples.corridor:4', '--out', str(path), '--size',
+                     '24']) == 0
+    assert 'steps' not in capsys.readouterr().err
+    name = f'grid:{path}'
+    simulator = open_simulator([name], Setup(1, robot_for([name]), 24))
+    place = simulator.places[0]
+    assert simulator.capabilities.depth and simulator.label_names == ('floor', 'ceiling', 'wall')
+    # 4 m long and 2 m wide, less the robot: eight cells and more side by side, and no wall is one.
+    assert len(place.scene.poses) // 4 >= 8 and place.cells[:, 0].max() <= 4 - 0.18
+    assert np.abs(place.cells[:, 1]).max() <= 1 - 0.18
+    assert len(place.goals) == 4
+    simulator.close()
+    for refused, words in ((scene(dump[0]), 'put anywhere'), ('nonsense', 'SIMULATOR:PLACE')):
+        assert cli.main(['simulators', 'dump', refused, '--out', str(tmp_path / 'x.h5')]) == 2
+        assert words in capsys.readouterr().err
+    assert cli.main(['simulators', 'dump', 'house:3', '--out', str(tmp_path / 'no' / 'x.h5')]) == 2
+    assert not list(tmp_path.glob('.*'))  # nothing half written

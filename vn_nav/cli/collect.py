@@ -25,11 +25,12 @@ def run(args: argparse.Namespace) -> int:
     """`vn_nav collect`."""
     check_backend(args.backend)
     from vn_nav.bags.storage.writer import BagWriter
-    from vn_nav.robot import RobotSpec, load_robot
+    from vn_nav.robot import load_robot
     from vn_sim_bridge.datasets.collect import collect, random_views
     from vn_sim_bridge.render.randomisation import load_randomisation
+    from vn_sim_bridge.simulators import robot_for
     names = training_scenes(args)
-    robot = load_robot(args.robot) if args.robot else RobotSpec()
+    robot = robot_for(names, load_robot(args.robot) if args.robot else None)
     scenes = random_views(names, args.size, robot, load_randomisation(args.randomisation),
                           args.seed, args.threads)
     begun = time.monotonic()

@@ -13,7 +13,7 @@ from vn_nav.cli.options import command_line, parse_changes
 from vn_nav.cli.scenes import split_scenes, training_scenes
 from vn_nav.cli.world import add_world, check_backend, machine, make_env
 from vn_nav.errors import UserError
-from vn_nav.learning.left_out import config_without
+from vn_nav.learning.left_out import ALWAYS, config_without
 from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.learning.pretrain_job import load_bags, print_line
@@ -170,7 +170,8 @@ def run(args: argparse.Namespace) -> int:
                    objects=args.objects, goals_per_room=args.goals_per_room,
                    goal_variants=args.goal_variants,
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
-    config, words = config_without(config, env.config.privileged, env.simulator_name)
+    config, words = config_without(config, env.config.privileged, env.simulator_name,
+                                   always=ALWAYS if env.distance_unit else ())
     for line in words:
         print(line, flush=True)
     bags = _bag_mix(args, config, env.robot)

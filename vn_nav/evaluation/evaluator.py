@@ -173,13 +173,12 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
         threshold: of the arrival head; None: 0.5.
         seed: of environments and sampled actions.
         known: scenes that the policy was trained in, see `PolicyActor`.
-        robot: for durations; the standard robot if left out.
+        robot: for durations; that of the environment if left out.
 
     Returns:
         By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
         'declared': ...}; without an arrival head 'arrival' alone.
     """
-    robot = robot or RobotSpec()
     rows: Rows = {}
     threshold = STOP_THRESHOLD if threshold is None else threshold
     each = -(-episodes // len(scenes))
@@ -194,7 +193,8 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
                 for name, (actor, shown) in actors.items():
                     env.set_shown_goal(shown)
                     rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
-                        env, actor, rounds * environments, seed=seed + chunk, robot=robot))
+                        env, actor, rounds * environments, seed=seed + chunk,
+                        robot=robot or env.robot))
                 own, _ = next(iter(actors.values()))
                 if env.config.task != 'image' or not (
                         isinstance(own, PolicyActor) and own.knows_arrival):

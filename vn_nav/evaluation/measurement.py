@@ -28,7 +28,7 @@ class EvaluateConfig:
     controls: tuple[str, ...] = evaluator.CONTROLS  # on the same starts
     # Probability above which the arrival head declares a stop; None: the checkpoint's.
     stop_threshold: float | None = None
-    robot: RobotSpec | None = None  # for durations; None: the standard robot
+    robot: RobotSpec | None = None  # for durations; None: the scenes' own
 
     def __post_init__(self):
         threshold = self.stop_threshold
@@ -95,6 +95,11 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
         can = env.simulator.capabilities
         if not (can.geodesic or env.simulator.planner) and evaluator.SHORTEST in controls:
             controls.remove(evaluator.SHORTEST)
+        # One goal has no other to take for it; where there is none, none is shown.
+        if min(len(place.goals) for place in env.places) < 2 and evaluator.WRONG in controls:
+            controls.remove(evaluator.WRONG)
+        if can.own_actions and evaluator.BLANK in controls:
+            controls.remove(evaluator.BLANK)
         return env
 
     return evaluator.measure(

@@ -32,7 +32,7 @@ class Episode:
     seconds: float  # at the robot's default limits
     stop_distance: float  # m, geodesic, at the end
     stop_heading: float  # rad, unsigned, at the end
-    unit: str = 'm'  # of distances and path: 'm', or 'steps' (decisions) on a grid
+    unit: str = 'm'  # of distances and path: 'm'; 'steps' (decisions) on a grid; '': none
     reward: float = 0.0  # undiscounted return
     goal: str = ''
     scene: str = ''  # its name
@@ -79,7 +79,8 @@ def summarise(episodes: Sequence[Episode]) -> dict:
     """All figures over some episodes, ready for JSON.
 
     `spl` and `start_distance` are None where the simulator knows no ways. On a grid
-    `stop_error_steps` stands in place of `stop_error_m`, and `start_distance` counts steps.
+    `stop_error_steps` stands in place of `stop_error_m`, and `start_distance` counts steps. Stop
+    errors and seconds are None where a simulator's actions are no motions.
 
     Under declared stop there are three more: `declared` and `false_stops`, the shares of episodes
     that the policy ended, and that it ended in vain, and `reached`, the share in which the robot
@@ -109,7 +110,7 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'collisions': sum(e.collisions for e in episodes) / max(decisions, 1),
         'contact_free_success': float(np.mean(
             [e.success and e.collisions == 0 for e in episodes])),
-        f'stop_error_{unit}': float(np.mean([e.stop_distance for e in episodes])),
+        f'stop_error_{unit or "m"}': float(np.mean([e.stop_distance for e in episodes])),
         'stop_error_deg': math.degrees(float(np.mean([e.stop_heading for e in episodes]))),
         'decisions': decisions / len(episodes),
         'decisions_interval': list(bootstrap_interval([e.decisions for e in episodes])),
@@ -117,6 +118,8 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'return': float(np.mean([e.reward for e in episodes])),
         'start_distance': _mean_or_none([e.start_distance for e in episodes]),
     }
+    if not unit:  # nobody knows where anything is, or how long an action takes
+        figures |= dict.fromkeys(('stop_error_m', 'stop_error_deg', 'seconds'))
     if asked == {True}:
         figures |= {
             'declared': float(np.mean([e.declared for e in episodes])),

@@ -13,22 +13,24 @@ from vn_nav.learning.presets import TrainConfig
 ALWAYS = ('arrived', 'distance')
 WORDS = {'depth': 'depth', 'segmentation': 'labels', 'goal_segmentation': 'labels',
          'overlap': 'what two pictures share', 'explorer_action': 'walls',
-         'oracle_action': 'driving distances', 'oracle_regret': 'the cost of each action'}
+         'oracle_action': 'driving distances', 'oracle_regret': 'the cost of each action',
+         'arrived': 'arrival', 'distance': 'distances'}
 
 
-def config_without(config: TrainConfig, told: Collection[str], simulator: str
-                   ) -> tuple[TrainConfig, list[str]]:
+def config_without(config: TrainConfig, told: Collection[str], simulator: str, *,
+                   always: Collection[str] = ALWAYS) -> tuple[TrainConfig, list[str]]:
     """A training without the tasks whose keys nobody tells; their heads are left out as well.
 
     Args:
         config: the training.
         told: keys of `info` that the environment gives.
         simulator: its name, for people.
+        always: what it knows beside.
 
     Returns:
         The configuration, and what is left out and why, in words.
     """
-    known = {*told, *ALWAYS}
+    known = {*told, *always}
     lost = {}
     for name in config.tasks:
         keys = TEACHERS[config.teacher] if name == 'imitation' else PRIVILEGED.get(name, ())

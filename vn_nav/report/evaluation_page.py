@@ -103,7 +103,8 @@ def _cards(rows: dict[str, dict], stop: str) -> str:
         (number(own['spl'], '.2f'), 'SPL', others('spl', '.2f')),
         (f'{own["collisions"]:.1%}', 'decisions with a collision',
          f'{own["contact_free_success"]:.0%} succeeded without any'),
-        (f'{own["decisions"]:.0f}', 'decisions an episode', f'{own["seconds"]:.0f} s of driving'),
+        (f'{own["decisions"]:.0f}', 'decisions an episode',
+         f'{number(own["seconds"], ".0f")} s of driving'),
     ]
     if stop == DECLARED:
         entries.insert(1, (f'{own["false_stops"]:.0%}', 'false stops',

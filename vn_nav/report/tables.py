@@ -23,10 +23,10 @@ COLUMNS: tuple[Column, ...] = (
     ('SPL', lambda r: number(r['spl'], '.2f')),
     ('decisions (95 %)', lambda r: '{:.0f} ({:.0f}-{:.0f})'.format(r['decisions'],
                                                                    *r['decisions_interval'])),
-    ('seconds', lambda r: f'{r["seconds"]:.0f}'),
+    ('seconds', lambda r: number(r['seconds'], '.0f')),
     ('collisions', lambda r: f'{r["collisions"]:.1%}'),
     ('contact-free', lambda r: f'{r["contact_free_success"]:.2f}'),
-    ('stop error', lambda r: f'{stop_error(r)} {r["stop_error_deg"]:.0f} deg'),
+    ('stop error', lambda r: stop_error(r)),
     ('return', lambda r: f'{r["return"]:.2f}'),
 )
 STOP_COLUMNS: tuple[Column, ...] = (
@@ -53,9 +53,11 @@ def unit(figures: dict) -> str:
 
 
 def stop_error(figures: dict) -> str:
-    """The distance at the end of episodes, in words."""
+    """Distance and heading error at the end of episodes, in words; a dash: nobody knows them."""
     name = unit(figures)
-    return f'{figures[f"stop_error_{name}"]:.2f} {name}'
+    if figures['stop_error_deg'] is None:
+        return '-'
+    return f'{figures[f"stop_error_{name}"]:.2f} {name} {figures["stop_error_deg"]:.0f} deg'
 
 
 def place(split: str, scenes: Sequence[str], bag: str | None = None) -> str:

@@ -19,7 +19,7 @@ from vn_sim_bridge.floor.places import FloorPlace, WalledPlace
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.simulator import Frames, Place, Setup
-from vn_sim_bridge.simulators import open_simulator
+from vn_sim_bridge.simulators import open_simulator, robot_for
 
 # How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.
 NEARBY = (0.30, 4.0, math.radians(75))
@@ -44,7 +44,7 @@ class PairSampler:
     Args:
         scenes: names, all of one simulator.
         size: side of the pictures [pixels].
-        robot: footprint and camera; the standard robot if left out.
+        robot: footprint and camera; the scenes' own if left out.
         randomisation: of light and camera; default: nothing varies.
         seed: of the draws.
         threads: threads that draw.
@@ -59,7 +59,7 @@ class PairSampler:
             raise UserError('there is at least one scene', scenes, 'name some')
         self.count = 0  # pairs drawn so far
         self._seed, self._size = seed, size
-        self.robot = robot or RobotSpec()
+        self.robot = robot_for(scenes, robot)
         self.simulator = open_simulator(scenes, Setup(1, self.robot, size, threads,
                                                       randomisation))
         self.places = list(self.simulator.places)

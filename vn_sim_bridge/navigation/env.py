@@ -239,8 +239,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     @property
     def distance_unit(self) -> str:
-        """Of distances and of the length of a path: 'm', or 'steps' (decisions)."""
-        return 'steps' if self.simulator.capabilities.steps else 'm'
+        """Of distances and of a path's length: 'm', 'steps' (decisions), or '': there are none."""
+        can = self.simulator.capabilities
+        return '' if can.own_actions else 'steps' if can.steps else 'm'
 
     @property
     def _judges_poses(self) -> bool:

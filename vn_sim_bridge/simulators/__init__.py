@@ -64,6 +64,9 @@ TABLE = {
     'grid': Entry('vn_sim_bridge.simulators.thor_grid',
                   'grids of pictures: dumps of AI2-THOR, and of other scenes',
                   'grid:bathroom_02?goals=26,37', ('h5py',), "pip install 'vn_nav[grid]'"),
+    'gym': Entry('vn_sim_bridge.simulators.gymnasium_env',
+                 'Gymnasium environments with pictures and discrete actions',
+                 'gym:MiniWorld-Hallway-v0'),
 }
 
 
