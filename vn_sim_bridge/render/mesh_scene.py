@@ -30,13 +30,15 @@ class Surface(NamedTuple):
     both_sides: bool = False
 
 
-def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | None = None) -> Scene:
-    """The scene of some surfaces, in groups of neighbours; fully lit everywhere.
+def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | None = None,
+               lamp: float = 1.0) -> Scene:
+    """The scene of some surfaces, in groups of neighbours; lit alike everywhere.
 
     Args:
         surfaces: what is to be seen.
         name: of the mesh, for errors.
         most_texels: textures are halved until all have no more together; None: as they are.
+        lamp: how much of a lamp's light arrives.
 
     Raises:
         UserError: nothing with an area, or more classes or instances than a pixel can name.
@@ -78,7 +80,7 @@ def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | Non
     boxes = np.concatenate([
         np.minimum.reduceat(corners.min(axis=1), group_start[:-1]) - 1e-4,
         np.maximum.reduceat(corners.max(axis=1), group_start[:-1]) + 1e-4], axis=1)
-    face_light, light_map, light = uniform_light(count)
+    face_light, light_map, light = uniform_light(count, lamp)
     return Scene(
         vertices=corners.reshape(-1, 3).astype(np.float32),
         face_start=np.arange(0, 3 * count + 1, 3, dtype=np.int32),
