@@ -64,7 +64,7 @@ from vn_sim_bridge.robot.goal_pictures import GoalPicture, load_goal_pictures, s
 from vn_sim_bridge.robot.joystick import Joystick
 from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
 from vn_sim_bridge.simulators.house import HouseSimulator
-from vn_sim_bridge.tools.contact_sheet import MARGIN, SCALE, house_map
+from vn_sim_bridge.tools.contact_sheet import MARGIN, SCALE, plan_map
 
 STAGES = ('record', 'teach', 'drive')
 BEFORE, AFTER, WRONG, RANDOM = ROWS = ('before', 'after', 'wrong picture', 'random actions')
@@ -265,7 +265,7 @@ def covered(house, poses: np.ndarray) -> tuple[float, float]:
 
 def _draw_map(path: Path, house, shown: Shown) -> None:
     """The way in red, what odometry says of it in grey."""
-    plan = house_map(house)
+    plan = plan_map(house.plan())
 
     def line(poses, colour, width):
         points = np.column_stack([(poses[:, 0] - house.outline.x0 + MARGIN) * SCALE,

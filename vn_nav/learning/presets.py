@@ -68,7 +68,7 @@ class TrainConfig(LearnerConfig):
     # and wherever its checkpoint is used, see `vn_nav.policy.action_filter`.
     action_filter: bool = True
     # Of icra2017: the file with the weights of ResNet-50 (without one: the small random encoder),
-    # and the scenes with layers of their own (house i of the environment is scene i).
+    # and the scenes with layers of their own (place i of the environment is scene i).
     frozen_weights: str = ''
     scenes: int = 1
     pixel_mean: float = 120.0
