@@ -2,6 +2,7 @@
 # needs. Where ROS 2 Jazzy is installed, the README's `colcon build` is the other way.
 #
 #   make demo      watch a robot drive to the places of pictures, in simulation, over ROS 2
+#                  (SCENE=NAME: in a scene of your own)
 #   make test      the fast tests (under 5 minutes)
 #   make test-all  every test (under 40 minutes)
 #   make soak      faults by the hundred: killed trainings, damaged bags and pictures, lost cameras,
@@ -36,7 +37,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := SYSTEM_DEFAULT
 .PHONY: demo test test-all soak lint docs clean
 
 demo: $(READY)
-	@$(BIN)/vn_nav demo
+	@$(BIN)/vn_nav demo $(if $(SCENE),--scene '$(SCENE)')
 
 # What computes runs side by side, one thread each; then what keeps time over ROS, alone. Both run,
 # whatever the first one found. $(call pytest,which,options)

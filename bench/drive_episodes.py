@@ -6,17 +6,18 @@ import json
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from record_drive import RecordedDrive, bridge_parameters, read_drive, write_figures
 
 from vn_nav.arrival import arrived
-from vn_nav.cli.demo import LINE
 from vn_nav.cli.world import machine
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.evaluation.evaluator import ARRIVAL, DECLARED, STOP_THRESHOLD
 from vn_nav.evaluation.metrics import Episode, summarise
+from vn_nav.nodes.isolation import stay_on_this_host
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.observation import preprocess
 from vn_nav.policy.checkpoint import load_checkpoint
@@ -35,6 +36,7 @@ BEFORE, AFTER, WRONG, RANDOM = ROWS = ('before', 'after', 'wrong picture', 'rand
 DRIVEN = ['odom', 'ground_truth/odom', 'cmd_vel', 'action', 'action_names', 'arrived', 'collision',
           'reward', 'episode_end', 'episode', 'episode_result', 'scene', '/diagnostics']
 RIGHT, OTHER = 'right', 'other'  # folders of goal pictures
+MET = ('odom', 'episode', 'action_names')  # of those: what both nodes say at the beginning
 MAX_SILENCE_S = 180.0  # without a finished episode
 DRIVE_SEED = 2026
 CHOICE = 8  # pictures of the bag; the one that shows most becomes a goal
@@ -99,19 +101,24 @@ def over_ros(options, row: str, checkpoint: Path, goals: Path) -> list[Episode]:
     name, robot = row.replace(' ', '_'), str(options.out / 'robot.yaml')
     bag = options.out / f'drive_{name}'
     shutil.rmtree(bag, ignore_errors=True)
+    stay_on_this_host()
+    from vn_nav.nodes.demo_watch import DemoWatch  # imports ROS
     processes = Processes(options.out / 'logs')
     bridge, policy = f'bridge_{name}', f'policy_{name}'
     try:
         processes.start('recorder', 'vn_nav.nodes.recorder_node',
                         {'output': str(bag), 'topics': DRIVEN})
-        processes.start(bridge, 'vn_sim_bridge.bridge_node', {
-            **bridge_parameters(options), 'goals': str(goals), 'seed': options.seed,
-            'stop': options.stop, 'episodes': options.episodes, 'exit_when_done': True})
-        processes.start(policy, 'vn_nav.nodes.policy_node', {
-            'checkpoint': str(checkpoint), 'robot': robot, 'time': 'lock_step',
-            'auto_enable': True, 'seed': options.seed,
-            'stop_threshold': _threshold(options, checkpoint)})
-        _wait(processes, bridge, policy, options.episodes)
+        with DemoWatch(processes, policy, bridge, MET) as watch:
+            processes.start(bridge, 'vn_sim_bridge.bridge_node', {
+                **bridge_parameters(options), 'goals': str(goals), 'seed': options.seed,
+                'stop': options.stop, 'episodes': options.episodes, 'exit_when_done': True},
+                (f'__node:={bridge}',))
+            processes.start(policy, 'vn_nav.nodes.policy_node', {
+                'checkpoint': str(checkpoint), 'robot': robot, 'time': 'lock_step',
+                'seed': options.seed, 'stop_threshold': _threshold(options, checkpoint)},
+                (f'__node:={policy}',))
+            watch.enable()
+            _wait(processes, bridge, watch, options.episodes)
     finally:
         processes.stop_all()
     (drive,) = drives_from_bag(bag)
@@ -126,19 +133,17 @@ def _threshold(options, checkpoint: Path) -> float:
     return 1.0 if options.stop == ARRIVAL else STOP_THRESHOLD if own is None else own
 
 
-def _wait(processes: Processes, bridge: str, policy: str, count: int) -> None:
+def _wait(processes: Processes, bridge: str, watch: Any, count: int) -> None:
     """Until the bridge has run its episodes."""
     done, progress = 0, time.monotonic()
     while processes.running[bridge].poll() is None:
-        for name in ('recorder', bridge, policy):
-            processes.check(name)
-        if (now := len(LINE.findall(processes.log(bridge)))) > done:
+        watch.spin(0.2)
+        if (now := len(watch.episodes)) > done:
             done, progress = now, time.monotonic()
             if done % 10 == 0:
                 print(f'{bridge}: {done} episodes of {count}', flush=True)
         if time.monotonic() - progress > MAX_SILENCE_S:
             raise ProcessFailure(f'no episode ended for {MAX_SILENCE_S:.0f} s')
-        time.sleep(0.2)
     processes.check(bridge)
 
 

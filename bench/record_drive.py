@@ -27,7 +27,7 @@ from vn_nav.scenes import house_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.robot.joystick import Joystick
 from vn_sim_bridge.robot.simulated_robot import TICK
-from vn_sim_bridge.tools.contact_sheet import MARGIN, SCALE, house_map
+from vn_sim_bridge.tools.contact_sheet import MARGIN, SCALE, plan_map
 
 TOPICS = ['image_raw', 'camera_info', 'odom', 'cmd_vel', 'collision', 'ground_truth/odom']
 CAMERA_RATE_HZ = 5.0  # in the bag that is learned from
@@ -219,7 +219,7 @@ def covered(house, poses: np.ndarray) -> tuple[float, float]:
 
 def _draw_map(path: Path, house, shown: RecordedDrive) -> None:
     """The way in red, what odometry says of it in grey."""
-    plan = house_map(house)
+    plan = plan_map(house.plan())
 
     def line(poses, colour, width):
         points = np.column_stack([(poses[:, 0] - house.outline.x0 + MARGIN) * SCALE,

@@ -9,8 +9,7 @@ import numpy as np
 from examples import corridor
 from vn_sim_bridge import simulators
 from vn_sim_bridge.floor.distance import FloorDistance
-from vn_sim_bridge.floor.floor_map import Rect, floor_map
-from vn_sim_bridge.houses.house import Room
+from vn_sim_bridge.floor.floor_map import Rect, Room, floor_map
 from vn_sim_bridge.simulator import Goal, no_objects
 
 BASE = corridor.CorridorSimulator

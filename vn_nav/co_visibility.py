@@ -1,4 +1,4 @@
-"""How two views of a house relate: the pose of one as the other sees it, and what both show.
+"""How two views of a place relate: the pose of one as the other sees it, and what both show.
 
 Pure functions of poses, depth pictures and cameras. They are labels for learning and figures for
 evaluation; no network is ever shown them. A leaf, because the simulator and learning from bags
@@ -43,7 +43,7 @@ def relative_pose(poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
 
 
 def lift(depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray) -> np.ndarray:
-    """Points of the house that pictures show, on a grid of `GRID` x `GRID` pixels.
+    """Points of the place that pictures show, on a grid of `GRID` x `GRID` pixels.
 
     Args:
         depth: [K,S,S] float32 m along the optical axis, 0 where nothing is seen.

@@ -1,1 +1,1 @@
-"""The simulator: houses, motion, pictures and tasks, and the bridge that shows them as a robot."""
+"""Simulators: places, motion, pictures and tasks, and the bridge that shows them as a robot."""

@@ -8,6 +8,7 @@ import torch
 from other_corridors import CLASSES, Lacking, ManyLabels, register
 
 from vn_nav.cli import main
+from vn_nav.cli.publish import held_out
 from vn_nav.errors import UserError
 from vn_nav.learning.left_out import config_without
 from vn_nav.learning.presets import preset
@@ -15,6 +16,7 @@ from vn_nav.learning.transfer import initial_weights
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig, tells
 from vn_sim_bridge.simulator import Setup
@@ -172,6 +174,8 @@ def test_the_thesis_goes_on_where_there_is_neither_depth_nor_labels(tmp_path, mo
     assert row['depth'] in ('', 'nan') and float(row['pixel_control']) >= 0
     assert main(['evaluate', str(two / 'checkpoint'), '--episodes', '2', '--max-decisions', '5',
                  '--no-controls']) == 0
+    assert main(['evaluate', str(two / 'checkpoint'), '--rooms', '3']) == 2
+    assert 'rooms are a number of houses' in capsys.readouterr().err
     # With labels again, of other classes: their heads begin anew.
     assert train('many:5', three, *begin) == 0
     told = capsys.readouterr().out
@@ -193,6 +197,18 @@ def test_fast_learns_what_there_is(tmp_path, monkeypatch, capsys):
     # What somebody asks for by name is no preset's wish.
     assert train('wayless:5', tmp_path / 'other', '--progress-reward', '1', preset='fast') == 2
     assert 'progress_reward' in capsys.readouterr().err
+
+
+def test_what_is_held_out_is_a_scene_of_the_policys_simulator(tmp_path, capsys):
+    path, _ = saved(tmp_path, dataclasses.replace(THESIS, actions=DRIVE_ACTIONS),
+                    simulator='examples.corridor', scenes=['examples.corridor:5'])
+    for unseen in ('house:7', '7', 'examples.corridor:5'):
+        assert main(['publish', str(path), str(tmp_path / 'other'), '--unseen', unseen]) == 2
+    assert 'held out' in capsys.readouterr().err and not (tmp_path / 'other').exists()
+    info = {'simulator': 'house', 'scenes': ['house:7?rooms=3']}
+    assert held_out('8', info) == held_out('house:8?rooms=3', info) == 'house:8?rooms=3'
+    info = {'simulator': 'examples.corridor', 'scenes': ['examples.corridor:5']}
+    assert held_out('examples.corridor:7', info) == 'examples.corridor:7'
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from vn_nav.scenes import house_scenes
 from vn_nav.vector_env import MeasuredVectorEnv, NavigationVectorEnv
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
-from vn_sim_bridge.navigation.gym_env import HouseNavigation
+from vn_sim_bridge.navigation.gym_env import HouseNavigation, Navigation
 from vn_sim_bridge.navigation.tasks import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_sim_bridge.render.randomisation import load_randomisation
 
@@ -31,6 +31,10 @@ def random_actions(env, seed=0):
 @pytest.mark.filterwarnings('ignore::UserWarning')
 def test_the_single_environment_passes_gymnasiums_checks():
     check_env(HouseNavigation(house=7, size=36))
+    check_env(Navigation('examples.corridor:5', size=36))
+    env = gymnasium.make('vn_nav/Navigation-v0', scene='house:3', size=36)
+    same = gymnasium.make('vn_nav/House-v0', house=3, size=36)
+    assert np.array_equal(env.reset(seed=1)[0]['image'], same.reset(seed=1)[0]['image'])
     env = gymnasium.make('vn_nav/House-v0', house=3, size=36, render_mode='rgb_array')
     observation, _ = env.reset(seed=1)
     assert np.array_equal(env.render(), observation['image'].transpose(1, 2, 0))

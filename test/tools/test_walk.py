@@ -7,16 +7,17 @@ import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 
-from vn_sim_bridge.houses.procedural import generate_house
+from vn_nav.cli import main
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.tools.walk import Walk, as_text
 
 
 def test_keys_move_turn_look_and_change_the_light():
-    walk = Walk(generate_house(7, rooms=2), 48, load_randomisation('standard'))
+    walk = Walk('house:7?rooms=2', 48, load_randomisation('standard'))
     start, first = walk.simulator.poses[0].copy(), walk.look()[0]
     assert walk.press('a') and walk.simulator.poses[0, 2] > start[2]
     assert walk.press('d') and np.allclose(walk.simulator.poses[0], start)
@@ -26,6 +27,16 @@ def test_keys_move_turn_look_and_change_the_light():
         walk.press('w')
     assert walk.touched and 'touching' in walk.look()[1]
     assert not walk.press('x')
+
+
+def test_other_scenes_are_looked_at_as_well(tmp_path):
+    walk = Walk('examples.corridor:5', 24)
+    picture, words = walk.look()
+    assert picture.shape == (24, 24, 3) and 'wall at' in words and 'doorway' not in words
+    assert walk.press('w')
+    path = tmp_path / 'sheet.png'
+    assert main(['house', 'show', '--scene', 'examples.corridor:5', '--out', str(path)]) == 0
+    assert cv2.imread(str(path)).std() > 20
 
 
 def test_a_picture_as_text_has_a_half_block_for_two_pixels():

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vn_nav.cli.world import load_for_scenes, make_env
+from vn_nav.cli.world import check_version, load_for_scenes, make_env
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode, drives_from_bag
 from vn_nav.evaluation.evaluator import (
@@ -30,12 +30,13 @@ from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.nodes.isolation import stay_on_this_host
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
-from vn_nav.report.demo_page import write_report
-from vn_nav.report.tables import TITLES
+from vn_nav.report.demo_page import kind_of, write_report
+from vn_nav.report.tables import TITLES, number
 from vn_nav.report.terminal import print_table
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
-from vn_nav.scenes import house_scene, rooms_of
+from vn_nav.scenes import HOUSE, house_scene, parse_scene, rooms_of, scene_name
+from vn_sim_bridge.simulators import simulator_class
 
 if TYPE_CHECKING:
     from vn_nav.nodes.demo_watch import EndedEpisode
@@ -53,7 +54,10 @@ RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `vn_nav demo`."""
     parser.add_argument('--out', type=Path, default=Path('demo'), help='folder for bag and page')
-    parser.add_argument('--episodes', type=int, default=20, help='in the trained house')
+    parser.add_argument('--scene', metavar='NAME', help='drive in this scene alone; default: the '
+                        'first one of the training, and of a policy of houses an unseen house')
+    parser.add_argument('--episodes', type=int, default=20,
+                        help='in the trained scene, or in that of --scene')
     parser.add_argument('--unseen-episodes', type=int, default=10, help='in an unseen house')
     parser.add_argument('--checkpoint', type=Path, help='instead of the shipped policy')
 
@@ -66,11 +70,11 @@ def run(args: argparse.Namespace) -> int:
         raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
                         task, 'use vn_nav evaluate')
     return demonstrate(args.out, folder, episodes=args.episodes,
-                       unseen_episodes=args.unseen_episodes)
+                       unseen_episodes=args.unseen_episodes, scene=args.scene)
 
 
-def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes: int = 10
-                ) -> int:
+def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes: int = 10,
+                scene: str | None = None) -> int:
     """Drive, record, measure, report.
 
     A checkpoint with a stop threshold has to declare its stop; for others arriving is enough.
@@ -78,21 +82,19 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
     Args:
         out: folder for bag, page and result.json; what an earlier demo left there is replaced.
         folder: of the checkpoint.
-        episodes, unseen_episodes: in the trained and in the unseen house.
+        episodes, unseen_episodes: in the trained scene and in the unseen house.
+        scene: to drive in alone; None: these two.
 
     Returns:
         The exit code.
     """
     if episodes < 1 or unseen_episodes < 1:
-        raise UserError('the demo has at least one episode in each house',
+        raise UserError('the demo has at least one episode in each scene',
                         (episodes, unseen_episodes), 'raise --episodes, --unseen-episodes')
     console = Console()
     loaded = load_checkpoint(folder)
     info = loaded.info
-    trained = info['scenes'][0]
-    unseen = house_scene(UNSEEN_HOUSE, rooms_of(trained))
-    places = (('trained', trained, episodes, TRAINED_LIMIT),
-              ('unseen', unseen, unseen_episodes, UNSEEN_LIMIT))
+    places = _places(info, scene, episodes, unseen_episodes)
     _import_ros()
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -140,11 +142,38 @@ def _import_ros() -> None:
                         "pip install 'vn_nav[ros]', or source an installed Jazzy") from error
 
 
+def _places(info: dict, scene: str | None, episodes: int, unseen_episodes: int
+            ) -> list[tuple[str, str, int, int]]:
+    """Where the demo drives: trained or unseen, the scene, episodes and their limit.
+
+    Raises:
+        UserError: no such scene, of another version than the policy's, or nobody names one.
+    """
+    if scene is not None:
+        scene = scene_name(scene)
+        simulator = parse_scene(scene).simulator
+        check_version(info, simulator=simulator)
+        known = scene in info['scenes']
+        return [('trained' if known else 'unseen', scene, episodes,
+                 TRAINED_LIMIT if known else UNSEEN_LIMIT)]
+    if not info['scenes']:
+        raise UserError('the demo drives in the scene of the training', 'a checkpoint that names '
+                        'none', 'give --scene')
+    trained = info['scenes'][0]
+    places = [('trained', trained, episodes, TRAINED_LIMIT)]
+    if parse_scene(trained).simulator == HOUSE:  # of which there are always others
+        places.append(('unseen', house_scene(UNSEEN_HOUSE, rooms_of(trained)), unseen_episodes,
+                       UNSEEN_LIMIT))
+    return places
+
+
 def bridge_parameters(checkpoint: LoadedCheckpoint, scene: str, count: int, limit: int) -> dict:
     """What the sim bridge simulates in one scene. `control_env` simulates the same."""
     info = checkpoint.info
+    varies = simulator_class(parse_scene(scene).simulator).capabilities.appearance
     return {'scene': scene, 'size': checkpoint.config.size,
-            'randomisation': info['randomisation'], 'seed': SEED, 'stop': _stop(info),
+            'randomisation': info['randomisation'] if varies else 'none',
+            'seed': SEED, 'stop': _stop(info),
             'robot': str(share_file(BASE)), 'episodes': count, 'max_decisions': limit}
 
 
@@ -166,11 +195,11 @@ def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, scene: str, co
 
 def _drive(console: Console, processes: Processes, folder: Path, checkpoint: LoadedCheckpoint,
            place: str, scene: str, count: int, limit: int, start_time: float) -> None:
-    """All episodes in one house."""
+    """All episodes in one scene."""
     from vn_nav.nodes.demo_watch import DemoWatch
     bridge, policy = f'bridge_{place}', f'policy_{place}'
     note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
-    console.print(f'\n[bold]{place} house[/], {scene}{note}')
+    console.print(f'\n[bold]{place} {kind_of(scene)}[/], {scene}{note}')
     with DemoWatch(processes, policy, bridge) as watch:
         processes.start(policy, 'vn_nav.nodes.policy_node', {
             'checkpoint': str(folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
@@ -248,11 +277,12 @@ def _paired(recorded: list[RecordedEpisode], in_process: list[Episode]) -> dict:
 
 
 def _show(console: Console, result: dict, out: Path) -> None:
-    for place in ('trained', 'unseen'):
+    for place in (name for name in ('trained', 'unseen') if name in result):
         figures = result[place]
         stop = f', {TITLES[DECLARED].lower()}' if figures['stop'] == DECLARED else ''
         console.print()
-        print_table(f'Measured from the bag: {place} house, {figures["episodes"]} episodes{stop}',
+        print_table(f'Measured from the bag: {place} {kind_of(figures["scene"])}, '
+                    f'{figures["episodes"]} episodes{stop}',
                     *_cells(figures))
     for name, path in (('page', 'report.html'), ('bag', 'bag'), ('figures', 'result.json')):
         console.print(f'{name:7} {out / path}', highlight=False, soft_wrap=True)
@@ -261,7 +291,7 @@ def _show(console: Console, result: dict, out: Path) -> None:
 
 
 def _cells(figures: dict) -> tuple[list[str], list[list[str]]]:
-    """Headings and lines of one house's table."""
+    """Headings and lines of one scene's table."""
     declared = figures['stop'] == DECLARED
     headings = ['policy', 'success', 'SPL', 'decisions', 'collisions',
                 *(('declared', 'false\nstops') if declared else ())]
@@ -270,7 +300,8 @@ def _cells(figures: dict) -> tuple[list[str], list[list[str]]]:
                       ('random', figures['random'])):
         low, high = r['success_interval']
         lines.append([
-            policy, f'{r["success"]:.0%} ({100 * low:.0f}-{100 * high:.0f})', f'{r["spl"]:.2f}',
+            policy, f'{r["success"]:.0%} ({100 * low:.0f}-{100 * high:.0f})',
+            number(r['spl'], '.2f'),
             '{:.0f} ({:.0f}-{:.0f})'.format(r['decisions'], *r['decisions_interval']),
             f'{r["collisions"]:.1%}',
             *((f'{r["declared"]:.0%}', f'{r["false_stops"]:.0%}') if declared else ())])

@@ -1,4 +1,4 @@
-"""`vn_nav evaluate`: a checkpoint in houses, or in a recorded drive."""
+"""`vn_nav evaluate`: a checkpoint in the scenes of a simulator, or in a recorded drive."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('checkpoint', type=Path)
     add_world(parser, defaults=False)
     parser.add_argument('--split', action='append', metavar='NAME',
-                        help='train, validation, test, unseen_look (other houses), seen_goals or '
-                        "unseen_goals (in the checkpoint's own houses; the first of the two is "
+                        help='train, validation, test, unseen_look (other scenes), seen_goals or '
+                        "unseen_goals (in the checkpoint's own scenes; the first of the two is "
                         'the default); may be given several times. In a bag: seen_goals, '
                         'unseen_goals, as `vn_nav teach` divides them; default: all')
     parser.add_argument('--bag', type=Path, metavar='BAG', help='measure in the pictures of this '
-                        'recorded drive, as `vn_nav teach` makes a place of it, not in houses')
+                        'recorded drive, as `vn_nav teach` makes a place of it, not in scenes')
     add_place_options(parser)
-    parser.add_argument('--houses', type=int, metavar='N', help='the first N houses of each split '
+    parser.add_argument('--houses', type=int, metavar='N', help='the first N scenes of each split '
                         f'(default: all of its own, {SPLIT_SCENES} others)')
     parser.add_argument('--episodes', type=int, default=100,
-                        help='of a row at least; the same number in each house')
+                        help='of a row at least; the same number in each scene')
     parser.add_argument('--max-decisions', type=int, default=300)
     parser.add_argument('--decoding', choices=('sample', 'greedy'))
     parser.add_argument('--stop-threshold', type=float, metavar='P', help='probability above '
@@ -105,7 +105,7 @@ def _check(args: argparse.Namespace) -> None:
         UserError: which option, and why.
     """
     rules = (
-        (args.houses is None or args.houses >= 1, 'a split has at least one house', args.houses,
+        (args.houses is None or args.houses >= 1, 'a split has at least one scene', args.houses,
          'raise --houses'),
         (not ((args.house or args.scene) and (args.split or args.houses)),
          'scenes are given by name or by split',
@@ -137,7 +137,11 @@ def _check_drive(args: argparse.Namespace) -> None:
 
 def _splits(args: argparse.Namespace, info: dict) -> dict[str, list[str]]:
     """The scenes of each split that is asked for."""
-    rooms = args.rooms or (_rooms(info) if info['simulator'] == HOUSE else None)
+    houses = info['simulator'] == HOUSE
+    if args.rooms and not (houses or args.house):
+        raise UserError('rooms are a number of houses', f'--rooms {args.rooms} with a policy of '
+                        f'{info["simulator"]}', 'leave it out')
+    rooms = args.rooms or (_rooms(info) if houses else None)
     if args.house or args.scene:
         return {'scenes': scenes_from(args, rooms)}
     found = {}

@@ -1,9 +1,12 @@
-"""`vn_nav house`: look at an embedded house."""
+"""`vn_nav house`: look at an embedded house, or at another scene."""
 
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
+
+from vn_nav.scenes import house_scene, scene_name
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -17,6 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action.add_argument('--seed', type=int, default=7)
         action.add_argument('--rooms', type=int, default=5)
         if name != 'export':
+            action.add_argument('--scene', metavar='NAME', help='another scene, of any simulator')
             action.add_argument('--randomisation', default='none' if out else 'standard',
                                 metavar='NAME', help='of light and camera: none, standard, rough '
                                 'or a YAML file')
@@ -27,12 +31,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _show(args: argparse.Namespace) -> int:
     """`vn_nav house show`."""
-    from vn_sim_bridge.houses.procedural import generate_house
     from vn_sim_bridge.render.randomisation import load_randomisation
     from vn_sim_bridge.tools.contact_sheet import write_contact_sheet
+    scene = _scene(args)
+    path = args.out or Path(f'house-{args.seed}.png' if args.scene is None else (
+        re.sub(r'\W+', '-', scene) + '.png'))
+    write_contact_sheet(path, scene, load_randomisation(args.randomisation))
+    if args.scene is not None:
+        print(path)
+        return 0
+    from vn_sim_bridge.houses.procedural import generate_house
     house = generate_house(args.seed, rooms=args.rooms)
-    path = args.out or Path(f'house-{args.seed}.png')
-    write_contact_sheet(path, house, load_randomisation(args.randomisation))
     print(f'{path}: {len(house.rooms)} rooms, {house.area:.0f} m2, '
           f'{house.scene.triangle_count} triangles, goals in '
           f'{", ".join(goal.room for goal in house.goals)}')
@@ -41,11 +50,15 @@ def _show(args: argparse.Namespace) -> int:
 
 def _walk(args: argparse.Namespace) -> int:
     """`vn_nav house walk`."""
-    from vn_sim_bridge.houses.procedural import generate_house
     from vn_sim_bridge.render.randomisation import load_randomisation
     from vn_sim_bridge.tools.walk import walk
-    walk(generate_house(args.seed, rooms=args.rooms), load_randomisation(args.randomisation))
+    walk(_scene(args), load_randomisation(args.randomisation))
     return 0
+
+
+def _scene(args: argparse.Namespace) -> str:
+    """The scene that is asked for."""
+    return scene_name(args.scene) if args.scene else house_scene(args.seed, args.rooms)
 
 
 def _export(args: argparse.Namespace) -> int:

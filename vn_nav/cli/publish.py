@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import re
 from pathlib import Path
 
 from vn_nav.cli.world import load_for_scenes, machine, make_env_for
@@ -13,7 +14,7 @@ from vn_nav.evaluation.measurement import EvaluateConfig, measure_checkpoint
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.report import tables
 from vn_nav.robot import load_robot
-from vn_nav.scenes import HOUSE, house_scene, rooms_of
+from vn_nav.scenes import HOUSE, house_scene, parse_scene, rooms_of, scene_name
 
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that are tried
 
@@ -22,7 +23,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `vn_nav publish`."""
     parser.add_argument('source', type=Path, help='checkpoint of a training run')
     parser.add_argument('target', type=Path, help='for example models/house')
-    parser.add_argument('--unseen', type=int, required=True, help='seed of a held-out house')
+    parser.add_argument('--unseen', required=True, metavar='SCENE',
+                        help='held out: the name of a scene, or the seed of a house')
     parser.add_argument('--episodes', type=int, default=100)
     parser.add_argument('--robot', type=Path, metavar='YAML', help='that it was trained for')
 
@@ -32,10 +34,12 @@ def run(args: argparse.Namespace) -> int:
     checkpoint, _ = load_for_scenes(args.source, args.robot)
     info = {key: value for key, value in checkpoint.info.items() if key != 'sha256'}
     scenes = info['scenes']
-    if info['simulator'] != HOUSE or not scenes:
-        raise UserError('a policy of embedded houses is published', f'{info["simulator"]} '
-                        f'{", ".join(scenes)}', 'publish one that was trained in houses')
-    unseen = house_scene(args.unseen, rooms_of(scenes[0]))
+    if not scenes:
+        raise UserError('a policy is published with figures of the scenes that it was trained in',
+                        'a checkpoint that names none', 'train it in a simulator')
+    unseen = held_out(args.unseen, info)
+    kind = 'house' if info['simulator'] == HOUSE else 'scene'
+    named = parse_scene(unseen).place if info['simulator'] == HOUSE else unseen
     save_checkpoint(args.target, checkpoint.network, info, half=True)
     shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
     if 'arrival' in shipped.config.heads:
@@ -43,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
         save_checkpoint(args.target, shipped.network, info, half=True)
         shipped = load_checkpoint(args.target)
     info['results'] = {}
-    for place, names in (('trained house', scenes),
-                         (f'unseen house {args.unseen}', [unseen])):
+    for place, names in ((f'trained {kind}', scenes),
+                         (f'unseen {kind} {named}', [unseen])):
         rows = _measure(shipped, names, args)
         results = evaluator.figures(rows)
         tables.print_rows(results, place)
@@ -58,6 +62,21 @@ def run(args: argparse.Namespace) -> int:
                       'docs/architecture.md.')
     save_checkpoint(args.target, shipped.network, info, half=True)
     return 0
+
+
+def held_out(text: str, info: dict) -> str:
+    """The scene that is held out.
+
+    Raises:
+        UserError: no scene of the policy's simulator, or one that it was trained in.
+    """
+    if re.fullmatch(r'\d{1,18}', text) and info['simulator'] == HOUSE:
+        return house_scene(int(text), rooms_of(info['scenes'][0]))
+    unseen = scene_name(text)
+    if parse_scene(unseen).simulator != info['simulator'] or unseen in info['scenes']:
+        raise UserError(f'the scene held out is one of {info["simulator"]} that the policy was '
+                        'not trained in', text, 'name another one with --unseen')
+    return unseen
 
 
 def _measure(checkpoint, scenes, args: argparse.Namespace, **changes) -> evaluator.Rows:

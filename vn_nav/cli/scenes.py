@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from vn_nav.errors import UserError
-from vn_nav.scenes import ROOMS, house_scenes, scene_name
+from vn_nav.scenes import HOUSE, ROOMS, house_scenes, scene_name
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +44,7 @@ def training_scenes(args: argparse.Namespace) -> list[str]:
         raise UserError('scenes are named, or the first N training houses',
                         '--scene or --house, and --houses', 'give one of them')
     count = 1 if args.houses is None else max(args.houses, 0)
-    return scenes_from(args) or split_scenes('house', 'train', count, args.rooms)
+    return scenes_from(args) or split_scenes(HOUSE, 'train', count, args.rooms)
 
 
 def split_scenes(simulator: str, split: str, count: int | None, rooms: int | None = None
@@ -67,5 +67,8 @@ def split_scenes(simulator: str, split: str, count: int | None, rooms: int | Non
                         split, 'choose one of them')
     found = list(splits[split][:count])
     if rooms not in (None, ROOMS):
+        if simulator != HOUSE:
+            raise UserError('rooms are a number of houses', f'--rooms {rooms} with {simulator}',
+                            'leave it out')
         found = [scene_name(f'{scene}?rooms={rooms}') for scene in found]
     return found

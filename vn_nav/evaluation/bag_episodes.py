@@ -42,14 +42,14 @@ class RecordedEpisode:
 
 @dataclasses.dataclass
 class Drive:
-    """All episodes in one house."""
+    """All episodes in one scene."""
 
     scene: dict
     episodes: list[RecordedEpisode]
 
 
 def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive]:
-    """Every house of a bag with its finished episodes, in order.
+    """Every scene of a bag with its finished episodes, in order.
 
     Args:
         folder: of the bag.

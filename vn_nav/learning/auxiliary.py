@@ -165,7 +165,7 @@ def imitation_loss(network: Policy, latents: Latents, rollout: Rollout, key: str
     """Cross-entropy of a teacher's actions in the states that the policy itself comes to.
 
     The teacher must be one that the policy can follow: one that knows no more than a robot could
-    have seen (the simulator's explorer), or, in a house known by heart, the shortest path. `key`
+    have seen (the simulator's explorer), or, in a place known by heart, the shortest path. `key`
     names its actions among the privileged. Weighted down to nothing in the course of a training,
     so that reinforcement has the last word (Ross et al. 2011; Schmitt et al., arXiv 1803.03835).
     Of what each action loses, [T,B,A] float, it is the cross-entropy with `softened` choices.

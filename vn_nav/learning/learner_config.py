@@ -57,7 +57,7 @@ class LearnerConfig:
     teacher_until: float = 0.5  # share of the training at which it has fallen to 0
     imitation_until: float = 0.7  # share of the training at which it has fallen to 0
     # Whom to imitate: one that knows what the robot has seen, or the shortest path, which only a
-    # policy that knows the house can follow: its actions, or (routes) what each action
+    # policy that knows the place can follow: its actions, or (routes) what each action
     # loses, where the simulator knows that.
     teacher: str = 'explorer'
     # The replay memory, used by `REPLAY_TASKS`, and by the image heads if `images_from_replay`.

@@ -72,7 +72,7 @@ def pretrain_pairs(network: Policy, source: PairSource, validation: PairSource, 
 
     Args:
         network: changed in place.
-        source, validation: pairs to learn from, and from houses of their own to judge by.
+        source, validation: pairs to learn from, and others to judge by.
         folder: gets `pairs_state` (at least every `save_seconds`) and `pairs.csv`.
         config: numbers.
         on_report: called with each row of the metrics.

@@ -71,7 +71,7 @@ class TrainConfig(LearnerConfig):
     action_filter: bool = True
     # Of icra2017: the file with the weights of ResNet-50, or `scene`: the features that the files
     # of grid scenes hold (without one: the small random encoder); and the scenes with layers of
-    # their own (house i of the environment is scene i).
+    # their own (place i of the environment is scene i).
     frozen_weights: str = ''
     scenes: int = 1
     pixel_mean: float = 120.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import rclpy
@@ -22,7 +23,7 @@ from vn_nav.nodes.recorder_node import RECEIVED
 from vn_nav.nodes.service_call import ServiceCall
 
 PATIENCE_S = 60.0  # until recorder, bridge and policy have met
-# The recorder has met the bridge and the policy once it has heard these of both.
+# The recorder has met the bridge and the policy once it has received these of both.
 MET = ('image_raw', 'odom', 'goal_image', 'episode', 'action_names')
 
 
@@ -43,9 +44,12 @@ class DemoWatch:
         processes: with the recorder `recorder` at work.
         policy: name of the policy's process and node.
         bridge: likewise; both are started while this is open.
+        met: recorded topics of both; the policy drives once all have been received.
     """
 
-    def __init__(self, processes: Processes, policy: str, bridge: str):
+    def __init__(self, processes: Processes, policy: str, bridge: str,
+                 met: Sequence[str] = MET):
+        self._met = met
         self._processes, self._policy = processes, policy
         self._children = ('recorder', policy, bridge)
         self._begun: dict[int, dict[str, Any]] = {}
@@ -107,7 +111,7 @@ class DemoWatch:
         """
         before = self._before or {}
         self._wait_for(lambda: all(self._received.get(name, 0) > before.get(name, 0)
-                                   for name in MET), 'the recorder hears bridge and policy')
+                                   for name in self._met), 'the recorder hears bridge and policy')
         client = self._node.create_client(SetBool, f'/{self._policy}/enable')
         self._wait_for(client.service_is_ready, f'{client.srv_name} is there')
         until = time.monotonic() + PATIENCE_S

@@ -142,7 +142,7 @@ class RosEnv:
 
     @property
     def scene(self) -> dict:
-        """What the first robot's simulator says of its house; empty: there is none."""
+        """What the first robot's simulator says of its scene; empty: there is none."""
         return self._robots[0].scene
 
     @property

@@ -28,10 +28,10 @@ INFO: dict[str, Any] = {
     'simulator': HOUSE,  # that it was trained in, see `vn_sim_bridge.simulators`
     'scenes': [],  # names, see `vn_nav.scenes`
     'task': 'image',  # what it was trained for
-    'objects': 1,  # in the house at a time
+    'objects': 1,  # in a place at a time
     'randomisation': 'none',  # of light, camera and base: a name, or a file's path
     'preset': '',  # see vn_nav.learning.presets
-    'goals_per_room': 1,  # of each house
+    'goals_per_room': 1,  # of each place
     'goal_variants': None,  # differently lit pictures of each goal; None: the randomisation's
     'stop_threshold': None,  # probability of arrival above which the policy declares its stop
     'seed': None,

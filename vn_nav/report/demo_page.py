@@ -14,9 +14,16 @@ from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
 from vn_nav.evaluation.metrics import Episode, path_efficiency
 from vn_nav.report.maps import Journey, floor_map
 from vn_nav.report.page import cards, page, picture, table
+from vn_nav.report.tables import number
+from vn_nav.scenes import HOUSE, parse_scene
 
 STRIP = 9  # pictures of a film strip
-TITLES = {'trained': 'The house it was trained in', 'unseen': 'A house it has never seen'}
+TITLES = {'trained': 'The {kind} it was trained in', 'unseen': 'A {kind} it has never seen'}
+
+
+def kind_of(scene: str) -> str:
+    """What to call a scene."""
+    return 'house' if parse_scene(scene).simulator == HOUSE else 'scene'
 
 
 def write_report(path: Path, drives: list[Drive], result: dict) -> None:
@@ -24,10 +31,11 @@ def write_report(path: Path, drives: list[Drive], result: dict) -> None:
 
     Args:
         path: of the HTML file.
-        drives: trained house, unseen house; with pictures.
+        drives: one a place of the figures, trained before unseen; with pictures.
         result: the figures, as in result.json.
     """
-    places = [(place, drive) for place, drive in zip(('trained', 'unseen'), drives, strict=True)]
+    places = [(place, drive) for place, drive in zip(
+        (name for name in TITLES if name in result), drives, strict=True)]
     body = ''.join(_place(place, drive, result[place]) for place, drive in places)
     path.write_text(page('vn_nav demo', f"""
 <h1>Show a robot a picture, and it drives there</h1>
@@ -35,7 +43,7 @@ def write_report(path: Path, drives: list[Drive], result: dict) -> None:
 policy were two processes that met on ROS topics alone. The policy saw the camera, the goal picture
 and its own last action; no map, no pose, no depth.</p>
 {body}
-<h2>Definitions</h2><dl>{_declared_stop(result['trained'])}
+<h2>Definitions</h2><dl>{_declared_stop(result[places[0][0]])}
 <dt>Success</dt><dd>At the end of a decision the robot stands within {ARRIVAL_RADIUS:g} m of the
 place (driving distance) and faces within {math.degrees(ARRIVAL_HEADING):g} degrees of the
 picture's direction. In brackets the 95 % interval.</dd>
@@ -65,7 +73,7 @@ def _place(place: str, drive: Drive, figures: dict) -> str:
     boxes = cards([
         (f'{figures["success"]:.0%}', f'success ({low:.0%} to {high:.0%})',
          f'random {control["success"]:.0%}'),
-        (f'{figures["spl"]:.2f}', 'SPL', f'random {control["spl"]:.2f}'),
+        (number(figures['spl'], '.2f'), 'SPL', f'random {number(control["spl"], ".2f")}'),
         (f'{figures["collisions"]:.1%}', 'decisions with a collision',
          f'random {control["collisions"]:.1%}'),
         (f'{figures["decisions"]:.0f}',
@@ -81,11 +89,12 @@ def _place(place: str, drive: Drive, figures: dict) -> str:
     stop = ' Declared stop.' if stops else ''
     limit = '' if place == 'trained' else (
         f' Episodes end at {figures["max_decisions"]} decisions here.')
+    size = (f'{len(scene["rooms_list"])} rooms, {scene["area"]:.0f} m&sup2;, '
+            if scene.get('rooms_list') else '')
     name = html.escape(scene.get('scene') or f'House {scene["house"]}')
-    return f"""<h2>{TITLES[place]}</h2>
-<p class="soft">{name}: {len(scene['rooms_list'])} rooms, {scene['area']:.0f}
-m&sup2;, {figures['episodes']} episodes, mean start distance
-{figures['start_distance']:.1f} m.{stop}{limit}</p>
+    return f"""<h2>{TITLES[place].format(kind=kind_of(figures['scene']))}</h2>
+<p class="soft">{name}: {size}{figures['episodes']} episodes, mean start distance
+{number(figures['start_distance'], '.1f')} m.{stop}{limit}</p>
 {boxes}
 <figure>{_map(drive)}<figcaption>Dots are starts, arrows are goals with their viewing direction;
 <span class="yes">green</span> journeys arrived, <span class="no">orange</span> ones did
@@ -129,14 +138,19 @@ def _journey(recorded: RecordedEpisode) -> str:
         f'<figcaption>{"decision " if k == 0 else ""}{number}</figcaption></figure>'
         for k, number in enumerate(numbers[i] for i in picked))
     kind, words = _outcome(e)
+    way = (f'\nfor a shortest way of {e.start_distance:.1f} m'
+           if math.isfinite(e.start_distance) else '')  # else nobody knows it
     return f"""<div class="journey"><h3>To the {html.escape(e.goal)}:
-<span class="{kind}">{words}</span> <small>after {e.decisions} decisions, {e.path_length:.1f} m
-for a shortest way of {e.start_distance:.1f} m</small></h3><div class="strip">
+<span class="{kind}">{words}</span>
+<small>after {e.decisions} decisions, {e.path_length:.1f} m{way}</small></h3>
+<div class="strip">
 <figure class="goal"><img alt="goal picture" src="{picture(recorded.goal_picture)}">
 <figcaption>goal picture</figcaption></figure>{frames}</div></div>"""
 
 
 def _map(drive: Drive) -> str:
+    if 'bounds' not in drive.scene:
+        return ''  # nobody has a map
     return floor_map(drive.scene,
                      [Journey(e.trajectory, e.episode.success) for e in drive.episodes],
                      [goal['pose'] for goal in drive.scene['goals']])

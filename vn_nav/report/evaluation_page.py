@@ -1,4 +1,4 @@
-"""One self-contained HTML page about an evaluation: figures, controls, houses, maps."""
+"""One self-contained HTML page about an evaluation: figures, controls, scenes, maps."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _cards(rows: dict[str, dict], stop: str) -> str:
 
 
 def choose(episodes: Sequence[Episode], count: int) -> list[Episode]:
-    """Episodes to show: half failures, as far as there are any; from many houses; long ways first.
+    """Episodes to show: half failures, as far as there are any; from many scenes; long ways first.
 
     Args:
         episodes: to choose from.

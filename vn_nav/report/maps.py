@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 
 PIXELS_PER_M = 46  # pixels per metre
-MARGIN_M = 0.3  # m around the house
+MARGIN_M = 0.3  # m around the place
 MIN_STEP_M = 0.02  # m: smaller steps add no points to a line
 
 
 @dataclasses.dataclass(frozen=True)
 class Journey:
-    """A way through a house."""
+    """A way through a place."""
 
     trajectory: np.ndarray  # [K,3] x, y [m], yaw [rad] in the map frame
     success: bool
@@ -27,7 +27,7 @@ def floor_map(plan: dict, journeys: Sequence[Journey], goals: Sequence[Sequence[
     """Top-down SVG, y upwards: journeys that arrived are green, the others orange.
 
     Args:
-        plan: the house as on the bridge's topic `scene`: `bounds`, `walls` and `outside` as
+        plan: the place as on the bridge's topic `scene`: `bounds`, `walls` and `outside` as
             rectangles (x0, y0, x1, y1) in metres, `obstacles` with a label as well, `rooms_list`
             of `name` and `rect`.
         journeys: to draw, dots at their starts.

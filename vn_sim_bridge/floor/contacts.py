@@ -53,8 +53,8 @@ class World:
 
     def reach(self, env_id: int, headings: np.ndarray, length: float) -> np.ndarray:
         """Where a translation of `length` [m] along each heading [rad] would end, [K,2] m."""
-        house = self.place_index[env_id]
-        rects = self._rects[self._first[house]:self._first[house + 1]]
+        place = self.place_index[env_id]
+        rects = self._rects[self._first[place]:self._first[place + 1]]
         return _reach(self.poses[env_id, 0], self.poses[env_id, 1], headings, length, rects,
                       self.radius)
 
@@ -153,11 +153,11 @@ def _travel(x, y, ux, uy, length, rects, radius):
 
 
 @numba.njit(cache=True)
-def _move(poses, env_ids, delta, house_index, first, rects, radius, done, touched):
+def _move(poses, env_ids, delta, place_index, first, rects, radius, done, touched):
     for k in range(len(env_ids)):
         n = env_ids[k]
-        house = house_index[n]
-        own = rects[first[house]:first[house + 1]]
+        place = place_index[n]
+        own = rects[first[place]:first[place + 1]]
         x, y, yaw, pitch = poses[n]
         dx, dy, dyaw = delta[k, 0], delta[k, 1], delta[k, 2]
         length = math.sqrt(dx * dx + dy * dy)

@@ -26,6 +26,14 @@ class Rect(NamedTuple):
         return (self.x1 - self.x0) * (self.y1 - self.y0)
 
 
+class Room(NamedTuple):
+    """A room: its name ('kitchen', 'bedroom 2', ...), its type and its floor inside the walls."""
+
+    name: str
+    kind: str
+    rect: Rect
+
+
 class FloorMap(NamedTuple):
     """A grid of cells; cell [i, j] has its centre at origin + ((j + 0.5), (i + 0.5)) * CELL."""
 

@@ -6,16 +6,13 @@ The kinds are structural: a place of a new simulator is one of them by having th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol, TypeGuard, runtime_checkable
+from typing import Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.floor.floor_map import FloorMap, Rect
+from vn_sim_bridge.floor.floor_map import FloorMap, Rect, Room
 from vn_sim_bridge.simulator import Place
-
-if TYPE_CHECKING:
-    from vn_sim_bridge.houses.house import Room
 
 
 @runtime_checkable

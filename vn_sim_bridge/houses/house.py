@@ -10,17 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vn_sim_bridge.floor.distance import FloorDistance
-from vn_sim_bridge.floor.floor_map import FloorMap, Rect, floor_map
+from vn_sim_bridge.floor.floor_map import FloorMap, Rect, Room, floor_map
 from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.simulator import Goal
-
-
-class Room(NamedTuple):
-    """A room: its name ('kitchen', 'bedroom 2', ...), its type and its floor inside the walls."""
-
-    name: str
-    kind: str
-    rect: Rect
 
 
 class Obstacle(NamedTuple):

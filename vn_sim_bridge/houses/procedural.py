@@ -8,6 +8,7 @@ from vn_nav.errors import UserError
 from vn_nav.scenes import house_scene
 from vn_sim_bridge.floor.floor_map import (
     FREE_MARGIN,
+    Room,
     clearance,
     floor_map,
     grid_of,
@@ -15,7 +16,7 @@ from vn_sim_bridge.floor.floor_map import (
 )
 from vn_sim_bridge.houses.bake import light_baker
 from vn_sim_bridge.houses.furniture import KINDS, OPTIONAL_PROBABILITY, ROOM_PROGRAMMES, TALL
-from vn_sim_bridge.houses.house import House, Obstacle, Room
+from vn_sim_bridge.houses.house import House, Obstacle
 from vn_sim_bridge.houses.labels import LABEL
 from vn_sim_bridge.houses.layout import (
     WALL,

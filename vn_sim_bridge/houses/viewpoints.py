@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from vn_sim_bridge.floor.floor_map import FloorMap
-from vn_sim_bridge.houses.house import Room
+from vn_sim_bridge.floor.floor_map import FloorMap, Room
 from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.scene import Scene
 

@@ -29,7 +29,7 @@ def draw_goal(count: int, seed: int, env, episode) -> int:
 
 
 def draw_wrong_goal(count: int, right: int, seed: int, env, episode) -> int:
-    """Another goal of the same house, for the wrong-goal control."""
+    """Another goal of the same place, for the wrong-goal control."""
     return (right + 1 + draw_index(count - 1, seed, Stream.WRONG_GOAL, env, episode)) % count
 
 

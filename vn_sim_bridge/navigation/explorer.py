@@ -1,7 +1,7 @@
 """A teacher that knows no more than a robot could: it explores until it has seen the goal.
 
 The shortest path to a goal that was never seen is nothing that a policy could learn from
-pictures. This teacher drives to the nearest part of the house that the robot has not looked at
+pictures. This teacher drives to the nearest part of the place that the robot has not looked at
 yet, and to the goal once the camera has shown what the goal picture shows
 (`co_visibility.co_visible`): what it does can be inferred from what the robot has seen (frontier
 exploration: Yamauchi 1997).
@@ -34,28 +34,28 @@ class Explorer:
     """What N robots have looked at in their episodes, and where each should go next.
 
     Args:
-        houses: the houses.
+        places: the places.
         num_envs: robots.
         fov: of the camera [rad]; turn, length: of one rotation [rad] and one forward move [m].
         radius: distance [m] from which on a robot only turns to the goal's heading.
     """
 
-    def __init__(self, houses: Sequence[WalledPlace], num_envs: int, *, fov: float, turn: float,
+    def __init__(self, places: Sequence[WalledPlace], num_envs: int, *, fov: float, turn: float,
                  length: float, radius: float):
-        rows = max(house.floor.free.shape[0] for house in houses)
-        columns = max(house.floor.free.shape[1] for house in houses)
-        self._free = np.zeros((len(houses), rows, columns), bool)
+        rows = max(place.floor.free.shape[0] for place in places)
+        columns = max(place.floor.free.shape[1] for place in places)
+        self._free = np.zeros((len(places), rows, columns), bool)
         shape = -(-rows // COARSE), -(-columns // COARSE)
-        self._open = np.zeros((len(houses), *shape), bool)  # a robot can stand somewhere in it
-        self._wall = np.ones((len(houses), *shape), bool)  # hides what is behind
-        for k, house in enumerate(houses):
-            free = house.floor.free
+        self._open = np.zeros((len(places), *shape), bool)  # a robot can stand somewhere in it
+        self._wall = np.ones((len(places), *shape), bool)  # hides what is behind
+        for k, place in enumerate(places):
+            free = place.floor.free
             self._free[k, :free.shape[0], :free.shape[1]] = free
             padded = np.zeros((shape[0] * COARSE, shape[1] * COARSE), bool)
             padded[:free.shape[0], :free.shape[1]] = free
             self._open[k] = padded.reshape(shape[0], COARSE, shape[1], COARSE).any(axis=(1, 3))
-            self._wall[k] = _walls(house, shape) & ~self._open[k]
-        self._origins = np.array([house.floor.origin for house in houses], float)
+            self._wall[k] = _walls(place, shape) & ~self._open[k]
+        self._origins = np.array([place.floor.origin for place in places], float)
         self._rays = np.linspace(-fov / 2, fov / 2, RAYS)
         self._turn, self._length, self._radius = turn, length, radius
         half = math.ceil(math.pi / turn)
@@ -68,13 +68,13 @@ class Explorer:
         self.seen[env_ids] = False
         self.found[env_ids] = False
 
-    def turns(self, poses: np.ndarray, house_index: np.ndarray, overlap: np.ndarray,
+    def turns(self, poses: np.ndarray, place_index: np.ndarray, overlap: np.ndarray,
               distance: np.ndarray, goal_yaw: np.ndarray, goal_maps: np.ndarray,
               turned: np.ndarray) -> np.ndarray:
         """Look from here, then say by how much each robot should turn; 0: drive forward.
 
         Args:
-            poses: [N,4] x, y [m], yaw, pitch [rad]; house_index: [N].
+            poses: [N,4] x, y [m], yaw, pitch [rad]; place_index: [N].
             overlap: [N] share of the goal picture in view.
             distance: [N] geodesic, to the goal [m]; goal_yaw: [N] rad.
             goal_maps: [N,rows,columns] geodesic distances to the goal [m].
@@ -85,17 +85,17 @@ class Explorer:
         """
         self.found |= overlap >= ENOUGH
         wanted = np.empty(len(poses))
-        _advise(poses, house_index, distance, goal_yaw, self.found, self.seen, self._open,
+        _advise(poses, place_index, distance, goal_yaw, self.found, self.seen, self._open,
                 self._wall, self._free, self._origins, goal_maps, turned, self._rays, self._turns,
                 self._turn, self._length, self._radius, wanted)
         return wanted
 
 
-def _walls(house: WalledPlace, shape: tuple[int, int]) -> np.ndarray:
+def _walls(place: WalledPlace, shape: tuple[int, int]) -> np.ndarray:
     """[rows,columns] of the explorer's cells that a wall touches, or that lie outside."""
     wall = np.zeros(shape, bool)
-    x0, y0 = house.floor.origin
-    for rect, label in house.obstacles:
+    x0, y0 = place.floor.origin
+    for rect, label in place.obstacles:
         if label in ('wall', 'outside'):
             low = int(max((rect.y0 - y0) / SIDE, 0)), int(max((rect.x0 - x0) / SIDE, 0))
             high = math.ceil((rect.y1 - y0) / SIDE), math.ceil((rect.x1 - x0) / SIDE)
@@ -194,23 +194,23 @@ def _around(x, y, field, side):
 
 
 @numba.njit(cache=True)
-def _advise(poses, house_index, distance, goal_yaw, found, seen, open_cells, walls, free_cells,
+def _advise(poses, place_index, distance, goal_yaw, found, seen, open_cells, walls, free_cells,
             origins, goal_maps, turned, rays, turns, turn, length, radius, wanted):
     rows, columns = open_cells.shape[1:]
     field = np.empty((rows, columns), np.float32)
     queue = np.empty(8 * rows * columns, np.int64)
     for n in range(len(poses)):
-        house = house_index[n]
-        x, y = poses[n, 0] - origins[house, 0], poses[n, 1] - origins[house, 1]
+        place = place_index[n]
+        x, y = poses[n, 0] - origins[place, 0], poses[n, 1] - origins[place, 1]
         yaw = poses[n, 2]
-        _look(x, y, yaw, rays, walls[house], seen[n])
-        exploring = not found[n] and _unseen_field(x, y, seen[n], open_cells[house], field, queue)
+        _look(x, y, yaw, rays, walls[place], seen[n])
+        exploring = not found[n] and _unseen_field(x, y, seen[n], open_cells[place], field, queue)
         if not exploring and distance[n] <= radius:
             wanted[n] = (goal_yaw[n] - yaw + math.pi) % (2 * math.pi) - math.pi
             if abs(wanted[n]) < 0.5 * turn:
                 wanted[n] = 0.0
             continue
-        free = free_cells[house]
+        free = free_cells[place]
         best, choice = math.inf, 0
         for k in turns:
             c, s = math.cos(yaw + k * turn), math.sin(yaw + k * turn)

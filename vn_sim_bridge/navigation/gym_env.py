@@ -7,34 +7,34 @@ import numpy as np
 from gymnasium import spaces
 
 from vn_nav.reset_arguments import read_options, read_seed
-from vn_nav.scenes import house_scene
+from vn_nav.scenes import ROOMS, house_scene
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.randomisation import load_randomisation
 
 
-class HouseNavigation(gymnasium.Env):
-    """One robot in one house, for tools that want a single `gymnasium.Env`.
+class Navigation(gymnasium.Env):
+    """One robot in one scene, for tools that want a single `gymnasium.Env`.
 
-    Observations: `image` and `goal`, both [3,H,W] uint8. Registered as `vn_nav/House-v0`.
+    Observations: `image` and `goal`, both [3,H,W] uint8. Registered as `vn_nav/Navigation-v0`;
+    `vn_nav/House-v0` is short for that with the scene of a house, by its seed and rooms.
 
     Args:
-        house: seed of the house; rooms: its number of rooms.
+        scene: its name.
         options: further fields of `EnvConfig`; the randomisation may be given by name or file, so
             that `spec.to_json()` can write it.
     """
 
     metadata = {'render_modes': ['rgb_array'], 'render_fps': 10}
 
-    def __init__(self, house: int = 0, rooms: int = 5, render_mode: str | None = None, **options):
+    def __init__(self, scene: str = 'house:0', render_mode: str | None = None, **options):
         self.render_mode = render_mode
         # JSON has no tuples.
         options = {name: tuple(value) if isinstance(value, list) else value
                    for name, value in options.items()}
         if isinstance(options.get('randomisation'), str):
             options['randomisation'] = load_randomisation(options['randomisation'])
-        self._batch = NavigationEnv(EnvConfig(scenes=(house_scene(house, rooms),), num_envs=1,
-                                              **options))
+        self._batch = NavigationEnv(EnvConfig(scenes=(scene,), num_envs=1, **options))
         size = self._batch.config.size
         picture = spaces.Box(0, 255, (3, size, size), np.uint8)
         self.observation_space = spaces.Dict({'image': picture, 'goal': picture})
@@ -73,6 +73,16 @@ class HouseNavigation(gymnasium.Env):
                 'goal': self._batch.goals[observation['goal_index'][0]].copy()}
 
 
+class HouseNavigation(Navigation):
+    """`Navigation` in the house of a seed, with a number of rooms."""
+
+    def __init__(self, house: int = 0, rooms: int = ROOMS, render_mode: str | None = None,
+                 **options):
+        super().__init__(house_scene(house, rooms), render_mode, **options)
+
+
 # By name: a callable cannot be written as JSON.
+gymnasium.register('vn_nav/Navigation-v0',
+                   entry_point='vn_sim_bridge.navigation.gym_env:Navigation')
 gymnasium.register('vn_nav/House-v0',
                    entry_point='vn_sim_bridge.navigation.gym_env:HouseNavigation')

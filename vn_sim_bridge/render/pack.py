@@ -18,7 +18,7 @@ FACING = np.array([0.98, 0.76, 0.88, 0.68, 1.0, 0.84], np.float32)
 
 
 class Lights(NamedTuple):
-    """How N cameras' houses are lit; linear factors, exposure included."""
+    """How N cameras' scenes are lit; linear factors, exposure included."""
 
     cube: np.ndarray  # [N,6,3] float32: ambient light on surfaces facing +x, -x, +y, -y, up, down
     lamps: np.ndarray  # [N,R,3] float32: the lamp of each room

@@ -1,4 +1,4 @@
-"""A person with a joystick who shows a robot around a house: velocities alone, no actions.
+"""A person with a joystick who shows a robot around a place: velocities alone, no actions.
 
 The person sees the room, so the true pose and the floor map are known here. Places all over the
 floor are visited one after the other, on curves that keep away from walls, and at each the robot
@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import heapq
 import math
+import re
+import zlib
 
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
+from vn_nav.robot import RobotSpec
+from vn_nav.scenes import parse_scene
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import CELL, clearance
-from vn_sim_bridge.houses.house import House
+from vn_sim_bridge.floor.places import WalledPlace
 from vn_sim_bridge.robot.simulated_robot import TICK
 
 MAX_LINEAR, MAX_ANGULAR = 0.3, 0.8  # m/s, rad/s
@@ -38,27 +42,29 @@ BACKING = 0.8, -0.15  # s, m/s
 
 
 class Joystick:
-    """Drives one robot around a house.
+    """Drives one robot around a place.
 
     Args:
-        house: that the person sees.
+        place: that the person sees.
         x, y: where the robot stands [m].
         spacing: of the places [m], about one for each square of that side.
         turns: turn around at every place; else the robot only passes.
         seed: of the person.
+        radius: of the robot's footprint [m].
 
     Attributes:
         places: [W,2] in the order in which they are visited [m].
         visited: how many have been; after the last one the way leads back, and counts on.
     """
 
-    def __init__(self, house: House, x: float, y: float, *, spacing: float = 1.0,
-                 turns: bool = True, seed: int = 0):
-        self._rng, self._turns = np.random.default_rng([seed, house.seed]), turns
-        self._floor = house.floor
-        self._gap = clearance(house.floor.origin, house.floor.free.shape, house.obstacle_rects
-                              ) - house.footprint_radius
-        places, fields = cover(house, self._gap, spacing)
+    def __init__(self, place: WalledPlace, x: float, y: float, *, spacing: float = 1.0,
+                 turns: bool = True, seed: int = 0,
+                 radius: float = RobotSpec().footprint_radius):
+        self._rng, self._turns = np.random.default_rng([seed, number_of(place.name)]), turns
+        self._floor = place.floor
+        self._gap = clearance(place.floor.origin, place.floor.free.shape, place.obstacle_rects
+                              ) - radius
+        places, fields = cover(place, self._gap, spacing)
         order = tour(places, fields, np.array([x, y]))
         self.places, self.visited = places[order], 0
         self._velocity, self._hand = np.zeros(2), np.zeros(2)  # vx [m/s], wz [rad/s]
@@ -178,7 +184,14 @@ class Joystick:
         return float(self._gap[i, j])
 
 
-def cover(house: House, gap: np.ndarray, spacing: float) -> tuple[np.ndarray, list[FloorDistance]]:
+def number_of(scene: str) -> int:
+    """A number for the random draws in a scene: the one in its name, if there is one."""
+    name = parse_scene(scene).place
+    return int(name) if re.fullmatch(r'\d{1,18}', name) else zlib.crc32(scene.encode())
+
+
+def cover(place: WalledPlace, gap: np.ndarray, spacing: float
+          ) -> tuple[np.ndarray, list[FloorDistance]]:
     """Places from which all of the floor is near, except for what is left over in corners.
 
     Greedy: the next place is the one with the most floor within `COVER` spacings, driving, that no
@@ -190,13 +203,13 @@ def cover(house: House, gap: np.ndarray, spacing: float) -> tuple[np.ndarray, li
     Returns:
         [W,2] positions [m], and the distances to each.
     """
-    cells = house.floor.centres()
-    rows, columns = np.nonzero(house.floor.free)
+    cells = place.floor.centres()
+    rows, columns = np.nonzero(place.floor.free)
     roomy = gap[rows, columns] >= ROOM_TO_TURN
     chosen = roomy & (rows % CANDIDATES == 0) & (columns % CANDIDATES == 0)
     candidates = cells[chosen if chosen.any() else roomy if roomy.any() else slice(None)]
     radius = COVER * spacing
-    fields = [house.geodesic(x, y) for x, y in candidates]
+    fields = [FloorDistance(place.floor, x, y) for x, y in candidates]
     near = np.array([field.at(cells) <= radius for field in fields])
     least = LEFT_OVER * math.pi * radius**2 / CELL**2
     open_floor = np.ones(len(cells), bool)

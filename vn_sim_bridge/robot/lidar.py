@@ -1,4 +1,4 @@
-"""A planar laser scanner in a house, exact: rays against what a robot cannot drive through.
+"""A planar laser scanner, exact: rays against what a robot cannot drive through.
 
 The same rectangles stop the robot, so that a map made from the scan, or a collision monitor that
 reads it, agrees with what the robot bumps into (a table is its whole outline, not four legs).

@@ -1,1 +1,1 @@
-"""Looking at houses: contact sheets, a walk with the keyboard."""
+"""Looking at scenes: contact sheets, a walk with the keyboard."""

@@ -1,4 +1,4 @@
-"""Walking through a house with the keyboard: in a window, or as coloured text in a terminal."""
+"""Walking through a scene with the keyboard: in a window, or as coloured text in a terminal."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.houses.house import House
-from vn_sim_bridge.houses.labels import LABELS
+from vn_sim_bridge.floor.places import with_rooms
 from vn_sim_bridge.render.randomisation import Randomisation
-from vn_sim_bridge.simulators.house import HouseSimulator
+from vn_sim_bridge.simulator import Setup
+from vn_sim_bridge.simulators import open_simulator
 
 STEP, TURN = 0.25, math.radians(15)  # m, rad a key
 VIEW = 512  # pixels of the window
@@ -36,17 +36,21 @@ class Walk:
     """A robot that keys move.
 
     Args:
-        house: where.
+        scene: its name.
         size: side of the pictures [pixels].
         randomisation: what 'l' draws another light from.
     """
 
-    def __init__(self, house: House, size: int, randomisation: Randomisation | None = None):
-        self.house, self.lights, self.touched = house, 0, False
-        self.simulator = HouseSimulator([house], [0], robot=RobotSpec(), size=size,
-                                        randomisation=randomisation)
-        x, y, yaw, _ = house.goals[0].pose
-        self.simulator.place(np.array([0]), np.array([[x, y, yaw, 0.0]]))
+    def __init__(self, scene: str, size: int, randomisation: Randomisation | None = None):
+        self.lights, self.touched = 0, False
+        self.simulator = open_simulator([scene], Setup(1, RobotSpec(), size,
+                                                       randomisation=randomisation))
+        self.place = self.simulator.places[0]
+        if self.simulator.capabilities.teleport:
+            x, y, yaw, _ = self.place.goals[0].pose
+            self.simulator.place(np.array([0]), np.array([[x, y, yaw, 0.0]]))
+        else:
+            self.simulator.spawn(np.array([0]), np.array([0], np.uint64))
 
     def press(self, key: str) -> bool:
         """Act on a key; False when it means to leave."""
@@ -66,15 +70,26 @@ class Walk:
         picture = np.ascontiguousarray(frames.rgb[0].transpose(1, 2, 0))
         middle = frames.depth.shape[1] // 2
         x, y, yaw, pitch = self.simulator.poses[0]
-        seen = LABELS[frames.labels[0, middle, middle]].replace('_', ' ')
-        status = (f'{self.house.room_at(x, y) or "doorway"}   x {x:.2f}  y {y:.2f} m  '
-                  f'heading {math.degrees(yaw):.0f}  tilt {0.0 - math.degrees(pitch):.0f} deg   '
-                  f'{seen} at {frames.depth[0, middle, middle]:.2f} m'
+        can, seen = self.simulator.capabilities, ''
+        if can.labels:
+            label = int(frames.labels[0, middle, middle])
+            seen = self.simulator.label_names[label].replace('_', ' ')
+        if can.depth:
+            seen += f' at {frames.depth[0, middle, middle]:.2f} m'
+        room = f'{self._room(x, y) or "doorway"}   ' if can.rooms else ''
+        status = (f'{room}x {x:.2f}  y {y:.2f} m  heading {math.degrees(yaw):.0f}  '
+                  f'tilt {0.0 - math.degrees(pitch):.0f} deg   {seen}'
                   f'{"   touching something" if self.touched else ""}')
         return picture, status
 
+    def _room(self, x: float, y: float) -> str:
+        """Name of the room at a point; empty: in none."""
+        return next((room.name for room in with_rooms(self.place).rooms
+                     if room.rect.x0 <= x <= room.rect.x1 and room.rect.y0 <= y <= room.rect.y1),
+                    '')
 
-def walk(house: House, randomisation: Randomisation | None = None) -> None:
+
+def walk(scene: str, randomisation: Randomisation | None = None) -> None:
     """Let a person drive: in a window where there is a display, else in the terminal.
 
     Raises:
@@ -84,16 +99,16 @@ def walk(house: House, randomisation: Randomisation | None = None) -> None:
         with contextlib.suppress(ImportError):  # Python without Tk: the terminal will do
             import tkinter
             with contextlib.suppress(tkinter.TclError):  # a display that does not answer
-                return _in_window(Walk(house, VIEW, randomisation), tkinter)
+                return _in_window(Walk(scene, VIEW, randomisation), tkinter)
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise UserError('walking needs a display or a terminal', 'neither',
                         'run it in a terminal, or look with vn_nav house show')
-    _in_terminal(house, randomisation)
+    _in_terminal(scene, randomisation)
 
 
 def _in_window(walk: Walk, tkinter) -> None:
     root = tkinter.Tk()
-    root.title(f'vn_nav {walk.house.name}')
+    root.title(f'vn_nav {walk.place.name}')
     view = tkinter.Label(root)
     view.pack()
     words = tkinter.Label(root, justify='left')
@@ -117,12 +132,12 @@ def _in_window(walk: Walk, tkinter) -> None:
     root.mainloop()
 
 
-def _in_terminal(house: House, randomisation: Randomisation | None) -> None:
+def _in_terminal(scene: str, randomisation: Randomisation | None) -> None:
     import termios
     import tty
     columns, lines = shutil.get_terminal_size()
     side = max(16, min(columns, 2 * (lines - 3)))
-    walk = Walk(house, max(64, side), randomisation)
+    walk = Walk(scene, max(64, side), randomisation)
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)
     sys.stdout.write('\x1b[?1049h\x1b[?25l')  # another screen, no cursor
