@@ -31,7 +31,7 @@ def export_mesh(scene: Scene, path: str | Path) -> None:
     if not path.parent.is_dir():
         raise UserError('the folder of the file exists', str(path.parent), 'create it first')
     out = _Glb()
-    textures = [out.picture(_picture(scene.textures, k))
+    textures = [out.picture(picture_of(scene.textures, k))
                 for k in range(len(scene.textures.side))]
     parts: dict[tuple, list[int]] = {}
     for face in range(len(scene.face_label)):
@@ -40,7 +40,7 @@ def export_mesh(scene: Scene, path: str | Path) -> None:
         parts.setdefault(key, []).append(face)
     for number, ((label, instance, texture, colour), faces) in enumerate(parts.items()):
         out.part(f'{LABELS[label]}_{instance}_{number}', f'{LABELS[label]}_{number}',
-                 *_triangles(scene, faces), textures[texture], colour)
+                 *triangles_of_faces(scene, faces), textures[texture], colour)
     try:
         path.write_bytes(out.bytes())
     except OSError as error:
@@ -106,7 +106,8 @@ class _Glb:
                 + struct.pack('<I4s', len(self.data), b'BIN\0') + self.data)
 
 
-def _triangles(scene: Scene, faces: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def triangles_of_faces(scene: Scene, faces: list[int]
+                       ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points [V,3], texture coordinates [V,2] (v downwards) and triangles [T,3] of some faces."""
     points, triangles, uv, count = [], [], [], 0
     for face in faces:
@@ -120,7 +121,8 @@ def _triangles(scene: Scene, faces: list[int]) -> tuple[np.ndarray, np.ndarray, 
     return np.concatenate(points), np.concatenate(uv), np.array(triangles)
 
 
-def _picture(textures: TextureSet, index: int) -> np.ndarray:
+def picture_of(textures: TextureSet, index: int) -> np.ndarray:
+    """A texture of a scene, [S,S,3] uint8."""
     side = textures.side[index]
     texels = textures.texels[textures.start[index]:textures.start[index] + side * side]
     return np.stack([texels & 255, texels >> 8 & 255, texels >> 16], axis=-1).astype(

@@ -46,6 +46,9 @@ TABLE = {
     'thor': Entry('vn_sim_bridge.simulators.thor',
                   'AI2-THOR, drawn by Unity', 'thor:FloorPlan227', ('ai2thor',),
                   "pip install 'vn_nav[thor]'"),
+    'suncg': Entry('vn_sim_bridge.simulators.suncg',
+                   "houses in SUNCG's format, drawn by this package", 'suncg:HOUSE_ID?level=0',
+                   ('PIL',), 'pip install "vn_nav[mesh]"'),
 }
 
 
