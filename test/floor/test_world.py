@@ -7,6 +7,7 @@ import pytest
 
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, normal, uniform
+from vn_sim_bridge.floor import contacts
 from vn_sim_bridge.floor.contacts import (
     MAX_TILT,
     ROTATION_NOISE,
@@ -107,3 +108,27 @@ def test_counter_numbers_are_functions_of_their_counter():
     numbers = normal(5, Stream.MOTION_NOISE, np.arange(20_000), 0, 0)
     assert abs(numbers.mean()) < 0.03 and abs(numbers.std() - 1) < 0.03
     assert abs(np.corrcoef(numbers[:-1], numbers[1:])[0, 1]) < 0.03
+
+
+def test_rectangles_far_away_change_nothing():
+    """A mesh has thousands: only near ones are looked at, and the contact is the same."""
+    rng = np.random.default_rng(5)
+    low = rng.uniform(-6, 6, (3000, 2))
+    rects = np.column_stack([low, low + rng.uniform(0.01, 0.12, (3000, 2))])
+    poses = np.zeros((40, 4))
+    while True:  # robots that touch nothing yet
+        free = [contacts._collides(*pose[:2], rects, 0.05) for pose in poses]
+        if not any(free):
+            break
+        poses[free, :2] = rng.uniform(-5, 5, (sum(free), 2))
+    poses[:, 2] = rng.uniform(-3, 3, 40)
+    length = rng.uniform(0.1, 1.5, 40)
+    delta = np.column_stack([length, np.zeros((40, 3))])
+    want = [contacts._travel(x, y, math.cos(yaw), math.sin(yaw), gone, rects, 0.05)
+            for (x, y, yaw, _), gone in zip(poses, length, strict=True)]
+    ends = poses[0, :2] + want[0] * np.array([math.cos(poses[0, 2]), math.sin(poses[0, 2])])
+    assert np.array_equal(contacts.reach_among(rects, 0.05, *poses[0, :2], poses[:1, 2],
+                                               length[0])[0], ends)
+    done, touched = contacts.move_among(rects, 0.05, poses, delta, np.arange(40))
+    assert np.allclose(done[:, 0], want, rtol=0, atol=1e-15) and touched.any()
+    assert np.array_equal(touched, np.array(want) < length)

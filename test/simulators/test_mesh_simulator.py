@@ -5,15 +5,18 @@ import functools
 import numpy as np
 import pytest
 from conformance import ROBOT, SIZE, Conformance
-from mesh_places import FLOOR, TABLE, WALL, box, flat, room_surfaces, surface
+from mesh_places import FLOOR, TABLE, WALL, box, flat, house_surfaces, room_surfaces, surface
 
 from vn_nav.errors import UserError
 from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.labels import LABELS
+from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.meshes.place import PlaceRules, RoomOutline, make_place
+from vn_sim_bridge.meshes.semantics import split_large
 from vn_sim_bridge.meshes.simulator import MeshSimulator
 from vn_sim_bridge.render.randomisation import Randomisation
+from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.simulator import Placed, Setup
 
 LEFT = np.array([(0, 0), (3, 0), (3, 4), (0, 4)], float)
@@ -126,6 +129,26 @@ def test_places_are_read_when_they_are_needed_and_let_go_of():
     assert simulator.cache.loads == loads, 'where robots are nothing is read again'
     simulator.close()
     assert len(simulator.cache) == 0
+
+
+@pytest.mark.slow
+def test_a_scene_of_many_triangles_is_drawn_whole():
+    """An embedded house in 400,000 triangles: no buffer overflows, no pixel is lost."""
+    house = generate_house(7, rooms=5)
+    surfaces = []
+    for part in house_surfaces(house):
+        colour = np.broadcast_to(part.colour, (len(part.corners), 3))
+        corners, _, colour = split_large(part.corners, None, colour, 0.05)
+        surfaces.append(part._replace(corners=corners, colour=colour))
+    place, scene = make_place('mesh:many', surfaces, LABELS, ROBOT)
+    assert scene.triangle_count > 400_000
+    whole, split = (Rasterizer([one], 96) for one in (house.scene, scene))
+    cells, rng = place.floor.centres(), np.random.default_rng(0)
+    cameras = np.column_stack([cells[rng.integers(len(cells), size=12)], np.ones(12),
+                               rng.uniform(-3, 3, 12), rng.uniform(-.2, .4, 12)])
+    a, b = (renderer.render(np.zeros(12, int), cameras, 1.57) for renderer in (whole, split))
+    assert not ((b[1] == 0) & (a[1] > 0)).any(), 'no holes'
+    assert (np.abs(a[1] - b[1]) < 0.01).mean() > 0.995 and (a[2] == b[2]).mean() > 0.995
 
 
 def test_what_is_wrong_is_said_at_the_start():

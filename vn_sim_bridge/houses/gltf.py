@@ -20,10 +20,12 @@ from vn_sim_bridge.houses.surface import (
     srgb_from_linear,
     unwrap,
 )
+from vn_sim_bridge.notices import say_once
 
 WRAPS = {10497: REPEAT, 33071: CLAMP, 33648: MIRROR}
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes; smaller ones are points and lines
 DRACO = 'KHR_draco_mesh_compression'
+UNEQUAL = 0.1  # between the colours of a triangle's vertices: to be seen, when they are averaged
 
 
 class _Texture(NamedTuple):
@@ -57,6 +59,8 @@ def read_gltf(path: Path) -> Iterator[Part]:
         UserError, or another exception: see `GltfData`.
     """
     data = GltfData(path)
+    if data.json.get('animations'):
+        say_once(f'{path.name}: animations are left out; nodes are where the file puts them')
     nodes = data.json.get('nodes', [])
     poses = _poses(nodes)
     materials: dict[int | None, _Material] = {}
@@ -246,6 +250,10 @@ def _material(data: GltfData, index: int | None) -> _Material:
         return _Material(None, np.ones(3), None, False)
     entry = data.get('materials', index)
     extensions = entry.get('extensions', {})
+    if entry.get('alphaMode', 'OPAQUE') != 'OPAQUE':
+        say_once(f'{data.path.name}: transparency (alphaMode) is left out; surfaces are opaque')
+    if 'emissiveTexture' in entry or any(entry.get('emissiveFactor', ())):
+        say_once(f'{data.path.name}: light that surfaces give off (emissive) is left out')
     if 'KHR_materials_pbrSpecularGlossiness' in extensions:
         own = extensions['KHR_materials_pbrSpecularGlossiness']
         factor, texture = own.get('diffuseFactor'), own.get('diffuseTexture')
@@ -289,7 +297,11 @@ def _part(data: GltfData, node: dict, mesh: dict, primitive: _Primitive, name: s
     colour = np.broadcast_to(material.factor, (len(faces), 3))
     if 'COLOR_0' in primitive.attributes:
         vertex = _rows(data, primitive.attributes['COLOR_0'], ('VEC3', 'VEC4'), len(points))
-        colour = colour * vertex[:, :3][faces].mean(axis=1)
+        own = vertex[:, :3][faces]
+        if (own.max(axis=1) - own.min(axis=1)).max() > UNEQUAL:
+            say_once(f'{data.path.name}: colours of vertices (COLOR_0) are averaged over each '
+                     'triangle')
+        colour = colour * own.mean(axis=1)
     uv = picture = None
     if material.texture is not None:
         texture = material.texture

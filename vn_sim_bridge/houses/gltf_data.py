@@ -21,6 +21,7 @@ from vn_sim_bridge.houses.surface import (
     find_file,
     read_bytes,
 )
+from vn_sim_bridge.notices import say_once
 
 COMPONENTS = {5120: 'i1', 5121: 'u1', 5122: '<i2', 5123: '<u2', 5125: '<u4', 5126: '<f4'}
 WIDTHS = {'SCALAR': 1, 'VEC2': 2, 'VEC3': 3, 'VEC4': 4, 'MAT4': 16}
@@ -66,6 +67,10 @@ class GltfData:
             if name not in EXTENSIONS:
                 raise UserError('a mesh file requires extensions that are known here',
                                 f'{path}: {name}', 'export it without this extension')
+        unknown = set(self.json.get('extensionsUsed', ())) - EXTENSIONS - set(COMPRESSED)
+        if unknown:
+            say_once(f'{path.name}: optional extensions are left out: '
+                     f'{", ".join(sorted(map(str, unknown)))}')
         self._quantised = 'KHR_mesh_quantization' in self.json.get('extensionsUsed', ())
         for entry in (*self.json.get('buffers', ()), *self.json.get('images', ())):
             if not entry.get('uri', 'data:').startswith('data:'):

@@ -31,7 +31,7 @@ def export_mesh(scene: Scene, path: str | Path) -> None:
     if not path.parent.is_dir():
         raise UserError('the folder of the file exists', str(path.parent), 'create it first')
     out = _Glb()
-    textures = [out.picture(picture_of(scene.textures, k))
+    textures = [out.picture(texture_picture(scene.textures, k))
                 for k in range(len(scene.textures.side))]
     parts: dict[tuple, list[int]] = {}
     for face in range(len(scene.face_label)):
@@ -121,8 +121,8 @@ def triangles_of_faces(scene: Scene, faces: list[int]
     return np.concatenate(points), np.concatenate(uv), np.array(triangles)
 
 
-def picture_of(textures: TextureSet, index: int) -> np.ndarray:
-    """A texture of a scene, [S,S,3] uint8."""
+def texture_picture(textures: TextureSet, index: int) -> np.ndarray:
+    """One texture of a set, [S,S,3] uint8."""
     side = textures.side[index]
     texels = textures.texels[textures.start[index]:textures.start[index] + side * side]
     return np.stack([texels & 255, texels >> 8 & 255, texels >> 16], axis=-1).astype(

@@ -22,6 +22,7 @@ from vn_sim_bridge.houses.surface import (
     read_bytes,
     unwrap,
 )
+from vn_sim_bridge.notices import say_once
 
 NO_MATERIAL = {'', 'none', '(null)', '(none)'}  # what exporters call none at all
 SURFACES = {'cstype', 'curv', 'curv2', 'surf'}  # free forms, which are no polygons
@@ -29,6 +30,7 @@ SURFACES = {'cstype', 'curv', 'curv2', 'surf'}  # free forms, which are no polyg
 OPTIONS = {'-s': 3, '-o': 3, '-t': 3, '-mm': 2, '-clamp': 1, '-blendu': 1, '-blendv': 1, '-cc': 1,
            '-bm': 1, '-boost': 1, '-texres': 1, '-imfchan': 1, '-type': 1, '-colorspace': 1}
 
+OPAQUE = {'d': 1.0, 'tr': 0.0}  # what they are where nothing shines through
 SWITCHES = {'-clamp', '-blendu', '-blendv', '-cc'}  # of them: on or off
 SHOWN = 60  # letters of a line that an error repeats
 MAX_INDEX = 2**31 - 1
@@ -199,6 +201,9 @@ def _materials(mesh: Path, library: Path) -> dict[str, _Material]:
                 if not rest.strip():
                     raise ValueError('it has no name')
                 own = found[rest.strip()] = _Material(np.ones(3))
+            elif word == 'map_d' or (
+                    word in OPAQUE and _numbers(rest.replace('-halo', ''), 1)[0] != OPAQUE[word]):
+                say_once(f'{library.name}: transparency ({word}) is left out; surfaces are opaque')
             elif word not in ('kd', 'map_kd'):
                 continue
             elif own is None:

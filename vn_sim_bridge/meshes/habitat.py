@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_sim_bridge.meshes.notices import say_once
 from vn_sim_bridge.meshes.parts import MAP, axes
+from vn_sim_bridge.notices import say_once
 
 SUFFIX = '.scene_dataset_config.json'
 ASSETS = ('.glb', '.gltf', '.obj')

@@ -28,6 +28,7 @@ from vn_sim_bridge.render.mesh_scene import Surface, mesh_scene
 from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.simulator import Goal
 
+LAMP = 0.7  # of a lamp's light: in standard light nothing is brighter than its own colour
 MOST_TEXELS = 48 << 20  # of one place: 256 MB with their halved pictures
 
 
@@ -143,7 +144,8 @@ def make_place(name: str, surfaces: Sequence[Surface], label_names: Sequence[str
     found = mesh_floor(corners + moved, kinds, label_names, robot.footprint_radius,
                        height=rules.height, step=rules.step, passable=rules.passable, name=name)
     scene = mesh_scene([surface._replace(corners=surface.corners + moved)
-                        for surface in surfaces], name, most_texels=rules.most_texels)
+                        for surface in surfaces], name, most_texels=rules.most_texels,
+                       lamp=LAMP)
     there = tuple(Room(room.name, room.kind, rect) for room in rooms
                   if room.low - rules.step <= level <= room.high
                   for rect in rectangles_of_polygons(room.polygons))

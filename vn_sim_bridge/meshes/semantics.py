@@ -11,13 +11,13 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_sim_bridge.houses.mesh import read_parts
 from vn_sim_bridge.houses.surface import Part, linear_from_srgb
-from vn_sim_bridge.meshes.notices import say_once
+from vn_sim_bridge.notices import say_once
 
 HEADER = 'HM3D Semantic Annotations'
 SPACING = 0.05  # m between samples of a semantic mesh
 VOXELS = (0.01, 0.05, 0.2)  # m: a triangle takes the class of what is so near
 LONGEST = 0.5  # m: larger triangles are split before they get a class
-MOST_SPLITS = 6  # times in halves
+MOST_SPLITS = 12  # times in halves
 
 
 class Thing(NamedTuple):
@@ -146,11 +146,12 @@ def _samples(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points), np.concatenate(owners)
 
 
-def split_large(corners: np.ndarray, uv: np.ndarray | None, colour: np.ndarray):
-    """Triangles none of whose sides is longer than `LONGEST`, as far as few halvings go."""
-    for _ in range(2 * MOST_SPLITS):
+def split_large(corners: np.ndarray, uv: np.ndarray | None, colour: np.ndarray,
+                longest: float = LONGEST):
+    """Triangles none of whose sides is longer than so many metres, as far as few halvings go."""
+    for _ in range(MOST_SPLITS):
         sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)  # [T,3]
-        large = sides.max(axis=1) > LONGEST
+        large = sides.max(axis=1) > longest
         if not large.any():
             break
         turn = sides[large].argmax(axis=1)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from vn_sim_bridge.houses.labels import LABELS
-from vn_sim_bridge.meshes.notices import say_once
+from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.render.mesh_scene import MOST_LABELS
 
 OTHER = 'object'  # whatever has no class of its own

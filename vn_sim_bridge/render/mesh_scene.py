@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from vn_nav.errors import UserError
+from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.render.scene import MAX_TEXTURE, Scene, TextureSet, as_labels, uniform_light
 
 GROUP = 64  # triangles culled together
@@ -29,13 +30,15 @@ class Surface(NamedTuple):
     both_sides: bool = False
 
 
-def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | None = None) -> Scene:
-    """The scene of some surfaces, in groups of neighbours; fully lit everywhere.
+def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | None = None,
+               lamp: float = 1.0) -> Scene:
+    """The scene of some surfaces, in groups of neighbours; lit alike everywhere.
 
     Args:
         surfaces: what is to be seen.
         name: of the mesh, for errors.
         most_texels: textures are halved until all have no more together; None: as they are.
+        lamp: how much of a lamp's light arrives.
 
     Raises:
         UserError: nothing with an area, or more classes or instances than a pixel can name.
@@ -77,7 +80,7 @@ def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | Non
     boxes = np.concatenate([
         np.minimum.reduceat(corners.min(axis=1), group_start[:-1]) - 1e-4,
         np.maximum.reduceat(corners.max(axis=1), group_start[:-1]) + 1e-4], axis=1)
-    face_light, light_map, light = uniform_light(count)
+    face_light, light_map, light = uniform_light(count, lamp)
     return Scene(
         vertices=corners.reshape(-1, 3).astype(np.float32),
         face_start=np.arange(0, 3 * count + 1, 3, dtype=np.int32),
@@ -92,7 +95,7 @@ def mesh_scene(surfaces: Sequence[Surface], name: str, *, most_texels: int | Non
         group_start=group_start.astype(np.int32),
         group_box=boxes.astype(np.float32),
         group_room=np.zeros(len(boxes), np.int32),
-        textures=TextureSet(_smaller(images, most_texels)),
+        textures=TextureSet(_smaller(images, most_texels, name)),
     )
 
 
@@ -125,13 +128,15 @@ def _images(surfaces: Sequence[Surface]) -> tuple[list[np.ndarray], dict[int, in
     return images, numbers
 
 
-def _smaller(images: list[np.ndarray], most: int | None) -> list[np.ndarray]:
+def _smaller(images: list[np.ndarray], most: int | None, name: str) -> list[np.ndarray]:
     """Pictures with at most so many texels together; the largest are halved first."""
     if most is None:
         return images
     side = MAX_TEXTURE
     while side > 16 and sum(min(max(image.shape[:2]), side)**2 for image in images) > most:
         side //= 2
+    if any(max(image.shape[:2]) > side for image in images):
+        say_once(f'{name}: textures are drawn with at most {side} pixels a side')
     return [_at_most(image, side) for image in images]
 
 

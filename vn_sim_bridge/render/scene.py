@@ -255,9 +255,9 @@ class SceneBuilder:
                 light_map.astype(np.float32), np.concatenate([light, spare]))
 
 
-def uniform_light(faces: int):
-    """Light arrays of F polygons that are fully lit everywhere."""
-    full = np.uint64(FULL_LIGHT * (1 | 1 << 16 | 1 << 32 | 1 << 48))
+def uniform_light(faces: int, lamp: float = 1.0):
+    """Light arrays of F polygons that are lit alike everywhere; `lamp` is how much of it comes."""
+    full = np.uint64(FULL_LIGHT * (1 | 1 << 32) | round(FULL_LIGHT * lamp) * (1 << 16 | 1 << 48))
     return (np.tile(np.array([[0, 2]], np.int32), (faces, 1)), np.zeros((faces, 4), np.float32),
             np.full(4, full, np.uint64))
 

@@ -49,6 +49,9 @@ TABLE = {
     'suncg': Entry('vn_sim_bridge.simulators.suncg',
                    "houses in SUNCG's format, drawn by this package", 'suncg:HOUSE_ID?level=0',
                    ('PIL',), 'pip install "vn_nav[mesh]"'),
+    'procthor': Entry('vn_sim_bridge.simulators.procthor',
+                      'houses of ProcTHOR, with boxes where there are no meshes',
+                      'procthor:house.json'),
 }
 
 

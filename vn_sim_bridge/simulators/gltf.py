@@ -18,12 +18,12 @@ from vn_nav.scenes import SceneName, options_of, whole_number
 from vn_nav.structured_file import read_json
 from vn_sim_bridge.floor.mesh_floor import HEIGHT
 from vn_sim_bridge.meshes.habitat import SUFFIX, Dataset, Instance
-from vn_sim_bridge.meshes.notices import say_once
 from vn_sim_bridge.meshes.parts import MAP, by_direction, named_surfaces
 from vn_sim_bridge.meshes.place import MeshPlace, PlaceRules, RoomOutline, make_place
 from vn_sim_bridge.meshes.semantics import SemanticMesh, Thing, read_annotations, split_large
 from vn_sim_bridge.meshes.simulator import MeshSimulator
 from vn_sim_bridge.meshes.vocabulary import OTHER, Vocabulary, class_name
+from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.render.mesh_scene import MOST_INSTANCES, Surface
 from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.simulator import Setup

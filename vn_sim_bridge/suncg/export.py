@@ -22,7 +22,7 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.houses.labels import LABELS
-from vn_sim_bridge.houses.mesh_export import picture_of, triangles_of_faces
+from vn_sim_bridge.houses.mesh_export import texture_picture, triangles_of_faces
 from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.suncg.axes import to_suncg
 from vn_sim_bridge.suncg.labels import FILE
@@ -260,7 +260,7 @@ def _write_textures(scene: Scene, things: Sequence[_Thing], folder: Path) -> Non
             for mesh in meshes}
     for number in sorted(used):
         path = folder / f'{_texture_name(number)}.png'
-        rgb = picture_of(scene.textures, number)
+        rgb = texture_picture(scene.textures, number)
         if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
             raise OSError(f'{path} cannot be written')
 

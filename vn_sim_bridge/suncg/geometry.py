@@ -20,7 +20,7 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_sim_bridge.houses.mesh import read_parts
 from vn_sim_bridge.houses.surface import Part, decode_picture, read_bytes
-from vn_sim_bridge.meshes.notices import say_once
+from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.render.mesh_scene import Surface
 from vn_sim_bridge.suncg.axes import to_map
 from vn_sim_bridge.suncg.house_json import HouseFile, Level, Material, Node
