@@ -95,13 +95,13 @@ $(READY): setup.py constraints.txt
 	@echo "Setting up $(VENV) (ROS 2 Jazzy wheels, PyTorch, tools): once, one to five minutes."
 	@[ "$$($(BIN)/python -c 'import pip, sys; print(sys.prefix)' 2>/dev/null)" = "$(CURDIR)/$(VENV)" ]\
 	 || $(PYTHON) -m venv --clear $(VENV)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,onnx,test]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,grid,onnx,test]'
 	@touch $@
 
 # The GPU kernels run in Warp's CPU mode too, but only some tests need its 400 MB; or the 280 MB of
 # a video encoder and Parquet.
 $(READY_ALL): $(READY)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot,thor]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot,thor,miniworld,vizdoom]'
 	@touch $@
 
 $(READY_DOCS): $(READY)

@@ -63,7 +63,10 @@ setup(
     packages=find_packages(include=[
         f'{package}{suffix}'
         for package in PACKAGES for suffix in ('', '.*')]),
-    package_data={package: ['py.typed'] for package in PACKAGES},  # PEP 561: they have types
+    package_data={  # PEP 561: they have types; and levels for DeepMind Lab
+        **{package: ['py.typed'] for package in PACKAGES},
+        'vn_sim_bridge.dmlab': ['levels/*.lua'],
+    },
     data_files=data_files,
     zip_safe=False,
     python_requires='>=3.11',
@@ -86,6 +89,10 @@ setup(
         # Wheels for x86-64 machines without ROS. Where Jazzy is installed they come from apt.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'train': ['tensorboard>=2.16'],
+        'grid': ['h5py>=3.8'],  # grid scenes: dumps of AI2-THOR are HDF5 files
+        # Gymnasium environments with pictures, `gym:NAME`; small ones that run without a display.
+        'miniworld': ['miniworld>=2.1'],
+        'vizdoom': ['vizdoom>=1.2.4'],
         'mesh': ['pillow>=10'],  # the textures of OBJ, GLB and glTF files
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`

@@ -51,6 +51,20 @@ class Action:
         return getattr(self, self.axis)
 
 
+class NamedAction(Action):
+    """An action of a simulator that is no motion of a base: it has a name alone."""
+
+    def __post_init__(self):
+        if any(getattr(self, axis) for axis in AXES):
+            raise UserError('an action that is no motion moves nothing', self.name,
+                            'use Action')
+
+    @property
+    def axis(self) -> str:
+        """An axis along which it is 0 long."""
+        return AXES[0]
+
+
 AXES = ('dx', 'dy', 'dyaw', 'dpitch')
 NAME_LENGTH = 100  # characters
 MAX_ACTIONS = 256

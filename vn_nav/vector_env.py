@@ -118,6 +118,7 @@ class MeasuredVectorEnv(NavigationVectorEnv, Protocol):
     place_index: Any  # [N] the place of each robot
     goal_poses: Any  # [G,4] x, y [m], yaw, pitch [rad]
     goal_rooms: Sequence[str]  # names of the goals
+    distance_unit: str  # of `distance`, `start_distance` and `path_length`: 'm' or 'steps'
     declare_action: int | None  # the action that says "I have arrived"; None: there is none
     single_action_space: Any
 

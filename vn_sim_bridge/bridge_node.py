@@ -32,7 +32,7 @@ from vn_nav.errors import UserError
 from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.process import Ended, compiling, run_node
 from vn_nav.nodes.qos import offered, qos
-from vn_nav.robot import RobotSpec, load_robot
+from vn_nav.robot import load_robot
 from vn_sim_bridge import bridge_messages, bridge_sensors
 from vn_sim_bridge.bridge_messages import Frames
 from vn_sim_bridge.bridge_parameters import PARAMETERS, first_stamp, scene_of
@@ -40,6 +40,7 @@ from vn_sim_bridge.bridge_sensors import Sensors
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.goal_pictures import load_goal_pictures
 from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
+from vn_sim_bridge.simulators import robot_for
 
 COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base brakes
 LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base brakes
@@ -69,9 +70,9 @@ class SimBridgeNode(Node):
         self.free = values['free_driving']
         self.episodes, self.exit_when_done = values['episodes'], values['exit_when_done']
         self.picture_ticks = max(1, round(1 / (values['camera_rate'] * TICK)))
-        robot = load_robot(values['robot']) if values['robot'] else RobotSpec()
         self.goals = load_goal_pictures(values['goals']) if values['goals'] else []
         scene = scene_of(values)
+        robot = robot_for([scene], load_robot(values['robot']) if values['robot'] else None)
         work = f'opening {scene}; the first start compiles the renderer, a minute'
         with compiling(self, ended, work):
             self.robot = SimulatedRobot(

@@ -15,7 +15,7 @@ PARAMETERS = {
     'backend': ('house', 'of the scene that house and rooms name: house', ('house',)),
     'house': (0, 'seed of a house, in place of scene'),
     'rooms': (ROOMS, 'number of its rooms', (1, 12)),
-    'robot': ('', 'YAML file of the robot; empty: the standard robot'),
+    'robot': ('', "YAML file of the robot; empty: the scene's own, or the standard robot"),
     'size': (84, 'side of the square camera picture [pixels]', (16, 1024)),
     'noise': (True, 'Gaussian motion noise, which odom does not see'),
     'odometry_drift': (0.0, 'errors of odom: 0 none, 1 as of a good indoor robot, more: worse',

@@ -48,10 +48,10 @@ class Distance(Protocol):
 
     @property
     def maximum(self) -> float:
-        """The largest distance of the place [m]."""
+        """The largest distance of the place [m, or steps with `capabilities.steps`]."""
 
     def at(self, poses: np.ndarray) -> np.ndarray:
-        """Of poses [K,>=2] to the goal, [K] m; inf where there is no way."""
+        """Of poses [K,>=2] to the goal, [K] m or steps; inf where there is no way."""
 
 
 class StraightDistance:
@@ -96,7 +96,7 @@ class Place(Protocol):
 class Capabilities:
     """What a simulator can do. A task that needs more refuses before its first step."""
 
-    continuous: bool  # any displacement; False: only whole actions of the robot, on a grid
+    continuous: bool  # any displacement; False: whole actions, on a grid: no noise, no slip
     depth: bool  # `Frames.depth` is what the camera sees; False: zeros
     labels: bool  # `Frames.labels` are classes of `label_names`; False: zeros
     geodesic: bool  # places know driving distances
@@ -109,6 +109,8 @@ class Capabilities:
     other_goals: bool = False  # `Setup.goals_per_room` and `Setup.goal_seed`
     own_objects: bool = False  # places have movable objects of their own: `scatter`
     rewards: bool = False  # it pays and ends episodes itself: `Motion.reward`, `Motion.ended`
+    steps: bool = False  # distances count decisions, of which a move and a turn are one each
+    own_actions: bool = False  # it has actions of its own, which are no motions: `act`
 
 
 class Motion(NamedTuple):
@@ -118,7 +120,6 @@ class Motion(NamedTuple):
     collided: np.ndarray  # [K] bool: it ended at a contact
     reward: np.ndarray | None = None  # [K] float32, of a simulator that pays itself
     ended: np.ndarray | None = None  # [K] bool: and has ended the episode
-    truncated: np.ndarray | None = None  # [K] bool: the simulator was lost meanwhile and replaced
 
 
 class Frames(NamedTuple):
@@ -214,6 +215,16 @@ class Simulator(Protocol):
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
         """Displace robots by [K,4] in their own frames, up to the first contact."""
 
+    def act(self, actions: np.ndarray, env_ids: np.ndarray) -> Motion:
+        """In place of `move`: actions [K] of its own, by number (`capabilities.own_actions`)."""
+
+    @property
+    def feature_size(self) -> int:
+        """F, how many frozen features `features` knows of a picture; 0: none."""
+
+    def features(self, place_index: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Frozen features [K,F] float32 of the pictures that `view` has, computed long ago."""
+
     def observe(self, env_ids: np.ndarray | None = None, keys: np.ndarray | None = None) -> Frames:
         """Pictures of the robots' cameras.
 
@@ -263,6 +274,12 @@ class Simulator(Protocol):
         Asked only where there is no depth.
         """
 
+    def broken_off(self) -> np.ndarray:
+        """[N] bool: whose episode broke off since the last call, by a crash for instance.
+
+        Such a robot can go on, but not in that episode: it is truncated.
+        """
+
     def close(self) -> None:
         """Let go of processes, files and memory; a second time it does nothing."""
 
@@ -279,6 +296,7 @@ class BaseSimulator(abc.ABC):
     """
 
     version: str = '1'
+    feature_size: int = 0
     capabilities: Capabilities
     label_names: Sequence[str] = ()
     # Names of movable objects, by task: `object` goes to one of them, in `collect` the first is
@@ -311,6 +329,20 @@ class BaseSimulator(abc.ABC):
         """Pictures from poses [K,4] in places [K]."""
         raise UserError('a simulator draws pictures from any pose', type(self).__name__,
                         'write its `draw`, or `observe` and `view`')
+
+    @classmethod
+    def own_robot(cls, scenes: Sequence[SceneName], robot: RobotSpec) -> RobotSpec:
+        """The robot that drives in some scenes unless another one is named; `robot`: standard."""
+        return robot
+
+    def act(self, actions: np.ndarray, env_ids: np.ndarray) -> Motion:
+        """See `Simulator`."""
+        raise UserError('a simulator with actions of its own does them', type(self).__name__,
+                        'write its `act`')
+
+    def features(self, place_index: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """See `Simulator`: nobody knows any."""
+        return np.zeros((len(poses), 0), np.float32)
 
     @property
     def seen_from(self) -> np.ndarray:
@@ -384,6 +416,10 @@ class BaseSimulator(abc.ABC):
     def co_visibility(self, goal_poses: np.ndarray) -> np.ndarray:
         """See `Simulator`: poses say nothing."""
         return np.full(self.num_envs, -1.0, np.float32)
+
+    def broken_off(self) -> np.ndarray:
+        """See `Simulator`: nothing breaks off."""
+        return np.zeros(self.num_envs, bool)
 
     def close(self) -> None:
         """See `Simulator`: there is nothing to let go of."""

@@ -6,11 +6,26 @@ import argparse
 import dataclasses
 import textwrap
 
+from vn_nav.cli import simulators_dump
 from vn_nav.errors import UserError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """It has none."""
+    """The actions of `vn_nav simulators`; none: the list."""
+    actions = parser.add_subparsers(dest='action', metavar='ACTION')
+    action = actions.add_parser('install', help='install what a simulator needs')
+    action.add_argument('name', help='of the simulator: dmlab')
+    action.add_argument('--system', action='store_true',
+                        help='also Debian packages; only as root')
+    action.set_defaults(run=_install)
+    simulators_dump.add_action(actions)
+
+
+def _install(args: argparse.Namespace) -> int:
+    """`vn_nav simulators install NAME`."""
+    from vn_sim_bridge.simulators import install
+    print(install(args.name, system=args.system))
+    return 0
 
 
 def run(args: argparse.Namespace) -> int:

@@ -36,7 +36,8 @@ NUMBERS = {
     'features': (int, "of the encoder's last layer"),
     'hidden': (int, 'units of the LSTM'),
     'blocks': (int, 'residual blocks a stage'),
-    'frozen_weights': (str, "of icra2017: file with ResNet-50's weights (torchvision's names)"),
+    'frozen_weights': (str, "of icra2017: file with ResNet-50's weights (torchvision's "
+                       'names); scene: the features in the files of grid scenes'),
     'scenes': (int, 'of icra2017: scenes with layers of their own'),
     'pair_minutes': (float, 'pre-train the encoder on picture pairs for so long first'),
     'pair_houses': (int, 'draw pairs from the first so many scenes of the split train'),

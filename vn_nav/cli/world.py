@@ -43,7 +43,7 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
              randomisation: str | Path = 'none', device: str = 'cpu',
              may_lack: Collection[str] | None = None,
              say: Callable[[str], None] = SAY, **options):
-    """A `NavigationEnv` of some scenes; without a robot file with the standard robot.
+    """A `NavigationEnv` of some scenes; without a robot file with the scenes' own robot.
 
     On a device other than the CPU it is a `WarpNavigationEnv`.
 
@@ -52,23 +52,25 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
             that cannot do them; then `privileged` are wishes as well. None: all must be there.
         say: receives the lines.
     """
-    from vn_nav.robot import RobotSpec, load_robot
+    from vn_nav.robot import load_robot
     from vn_sim_bridge.navigation.env import NavigationEnv
     from vn_sim_bridge.navigation.env_config import (
         EnvConfig,
         check_simulator,
         setup_for,
+        with_own_actions,
         without_the_unknown,
     )
     from vn_sim_bridge.render.randomisation import load_randomisation
-    from vn_sim_bridge.simulators import open_simulator
+    from vn_sim_bridge.simulators import open_simulator, robot_for
     config = EnvConfig(scenes=tuple(scenes), num_envs=envs,
                        randomisation=load_randomisation(randomisation), **options)
-    spec = load_robot(robot) if robot else None
+    spec = robot_for(config.scenes, load_robot(robot) if robot else None)
     if device == 'cpu':
         if may_lack is None:
             return NavigationEnv(config, spec, threads=threads)
-        own = (spec or RobotSpec()).with_actions(config.actions)
+        config = with_own_actions(config, spec)
+        own = spec.with_actions(config.actions)
         simulator = open_simulator(config.scenes, setup_for(config, own, threads))
         try:
             config, words = without_the_unknown(config, simulator, may_lack)
@@ -155,9 +157,9 @@ def load_for(path: Path, robot: Path | None = None):
         UserError: the robot has other actions or another camera.
     """
     from vn_nav.policy.checkpoint import load_checkpoint
-    from vn_nav.robot import RobotSpec, load_robot
+    from vn_nav.robot import load_robot
     checkpoint = load_checkpoint(path)
-    spec = load_robot(robot) if robot else RobotSpec()
+    spec = load_robot(robot) if robot else _trained_robot(checkpoint.info)
     # Or says which action is unknown, or too long.
     spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
@@ -168,6 +170,13 @@ def load_for(path: Path, robot: Path | None = None):
                         f'{present[0]:g} deg, {present[1]:g} m (robot {spec.name})',
                         'give its file with --robot, or train a policy for this robot')
     return checkpoint, spec
+
+
+def _trained_robot(info: dict):
+    """The robot of a policy that no file names: that of its scenes, or the standard one."""
+    from vn_nav.robot import RobotSpec
+    from vn_sim_bridge.simulators import robot_for
+    return robot_for(info['scenes']) if info['scenes'] else RobotSpec()
 
 
 def load_for_scenes(path: Path, robot: Path | None = None):

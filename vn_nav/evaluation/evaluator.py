@@ -77,6 +77,7 @@ def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: i
             found[n].append(Episode(
                 success=bool(info['success'][n]), start_distance=float(info['start_distance'][n]),
                 path_length=float(info['path_length'][n]), decisions=int(info['decisions'][n]),
+                unit=env.distance_unit,
                 collisions=int(collisions[n]), seconds=float(seconds[n]),
                 stop_distance=float(info['distance'][n]),
                 stop_heading=float(info['heading_error'][n]), reward=float(reward[n]),
@@ -133,7 +134,11 @@ class PolicyActor:
         if self.known:
             scene = scene_numbers([self.env.places[place].name for place in self.env.place_index],
                                   self.known)
-        actions = self.policy.act(observation, self.env.goals, reset, scene)
+        goals = self.env.goals
+        known = getattr(self.env, 'goal_features', None)
+        if known is not None and self.policy.takes_features(known.shape[-1]):
+            goals = known
+        actions = self.policy.act(observation, goals, reset, scene)
         declares = np.zeros(len(actions), bool)
         declare = self.env.declare_action
         if declare is not None:

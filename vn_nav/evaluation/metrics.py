@@ -32,6 +32,7 @@ class Episode:
     seconds: float  # at the robot's default limits
     stop_distance: float  # m, geodesic, at the end
     stop_heading: float  # rad, unsigned, at the end
+    unit: str = 'm'  # of distances and path: 'm', or 'steps' (decisions) on a grid
     reward: float = 0.0  # undiscounted return
     goal: str = ''
     scene: str = ''  # its name
@@ -48,12 +49,13 @@ class Episode:
 def path_efficiency(episode: Episode) -> float:
     """S * l / max(p, l): the episode's share in SPL (Anderson et al. 2018).
 
-    l is the geodesic start distance less the arrival radius, p the metres really moved. NaN where
-    nobody knows the shortest way.
+    l is the geodesic start distance less the arrival radius, p the metres really moved; on a grid
+    both are steps, and the goal has no radius. NaN where nobody knows the shortest way.
     """
     if math.isnan(episode.start_distance):
         return math.nan  # nobody knows the shortest way
-    shortest = max(episode.start_distance - ARRIVAL_RADIUS, 0.0)
+    radius = ARRIVAL_RADIUS if episode.unit == 'm' else 0.0
+    shortest = max(episode.start_distance - radius, 0.0)
     longest = max(episode.path_length, shortest)
     return float(episode.success) * (shortest / longest if longest > 0 else 1.0)
 
@@ -76,7 +78,8 @@ def _mean_or_none(values: Sequence[float]) -> float | None:
 def summarise(episodes: Sequence[Episode]) -> dict:
     """All figures over some episodes, ready for JSON.
 
-    `spl` and `start_distance` are None where the simulator knows no ways.
+    `spl` and `start_distance` are None where the simulator knows no ways. On a grid
+    `stop_error_steps` stands in place of `stop_error_m`, and `start_distance` counts steps.
 
     Under declared stop there are three more: `declared` and `false_stops`, the shares of episodes
     that the policy ended, and that it ended in vain, and `reached`, the share in which the robot
@@ -92,6 +95,10 @@ def summarise(episodes: Sequence[Episode]) -> dict:
     asked = {e.declared is not None for e in episodes}
     if len(asked) > 1:
         raise ValueError('arrival and declared stop are not mixed; received episodes of both')
+    units = {e.unit for e in episodes}
+    if len(units) > 1:
+        raise ValueError('metres and steps are not mixed; received episodes of both')
+    (unit,) = units
     success = [float(e.success) for e in episodes]
     decisions = sum(e.decisions for e in episodes)
     figures = {
@@ -102,7 +109,7 @@ def summarise(episodes: Sequence[Episode]) -> dict:
         'collisions': sum(e.collisions for e in episodes) / max(decisions, 1),
         'contact_free_success': float(np.mean(
             [e.success and e.collisions == 0 for e in episodes])),
-        'stop_error_m': float(np.mean([e.stop_distance for e in episodes])),
+        f'stop_error_{unit}': float(np.mean([e.stop_distance for e in episodes])),
         'stop_error_deg': math.degrees(float(np.mean([e.stop_heading for e in episodes]))),
         'decisions': decisions / len(episodes),
         'decisions_interval': list(bootstrap_interval([e.decisions for e in episodes])),

@@ -42,6 +42,7 @@ KINDS: dict[type, tuple] = {
     float: ('a number', _is_finite),
     str: ('a text', lambda value: isinstance(value, str)),
 }
+GIVEN = 'scene'  # `TrainConfig.frozen_weights`: the scenes bring the features
 BAG_WEIGHTS = ('bag_imitation', 'bag_goal_pose', 'bag_arrival', 'bag_distance', 'bag_image')
 
 
@@ -67,8 +68,9 @@ class TrainConfig(LearnerConfig):
     # Whether a policy that tracks its goal acts behind the filter of blocked actions, in rollouts
     # and wherever its checkpoint is used, see `vn_nav.policy.action_filter`.
     action_filter: bool = True
-    # Of icra2017: the file with the weights of ResNet-50 (without one: the small random encoder),
-    # and the scenes with layers of their own (house i of the environment is scene i).
+    # Of icra2017: the file with the weights of ResNet-50, or `scene`: the features that the files
+    # of grid scenes hold (without one: the small random encoder); and the scenes with layers of
+    # their own (house i of the environment is scene i).
     frozen_weights: str = ''
     scenes: int = 1
     pixel_mean: float = 120.0
@@ -139,6 +141,10 @@ class TrainConfig(LearnerConfig):
             if not kept:
                 raise UserError(rule, received, 'correct the training configuration')
 
+    @property
+    def _frozen(self) -> str:
+        return 'given' if self.frozen_weights == GIVEN else 'resnet50' * bool(self.frozen_weights)
+
     def network(self, actions: tuple[str, ...], size: int,
                 moves: tuple[tuple[float, float, float], ...] = (),
                 classes: int = CLASSES) -> NetworkConfig:
@@ -159,7 +165,7 @@ class TrainConfig(LearnerConfig):
             pose_to_memory=self.pose_to_memory, places=self.places,
             moves=moves if self.track_goal else (),
             action_filter='' if self.action_filter else NONE, pixel_mean=self.pixel_mean,
-            pixel_std=self.pixel_std, frozen='resnet50' if self.frozen_weights else '',
+            pixel_std=self.pixel_std, frozen=self._frozen,
             scenes=self.scenes)
 
 

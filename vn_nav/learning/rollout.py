@@ -102,7 +102,10 @@ class Collector:
         self.targets: dict[str, Tensor] = {}  # privileged, of the present observation
         self.goals = self._tensor(env.goals)
         if isinstance(network, ScenePolicy):
-            self.goals = network.look(self.goals)
+            known = getattr(env, 'goal_features', None)
+            self._takes_features = known is not None and network.takes_features(known.shape[-1])
+            self.goals = (self._tensor(known) if self._takes_features
+                          else network.look(self.goals))
         self._scenes = network.config.scenes
         n = env.num_envs
         self.observation: dict[str, Tensor] = {}
@@ -236,7 +239,9 @@ class Collector:
             return
         assert isinstance(self.network, ScenePolicy)  # no other has room for them
         # Never encoded again: not by the learner either.
-        seen.extras['features'][t] = self.network.look(seen.image[t])
+        # What a simulator's files hold is not computed at all.
+        seen.extras['features'][t] = (self.observation['features'] if self._takes_features
+                                      else self.network.look(seen.image[t]))
         if self._scenes > 1:
             if not isinstance(self.env, PlacedEnv):
                 raise UserError('layers for several scenes need to know which scene a robot is in',

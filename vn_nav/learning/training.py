@@ -25,7 +25,7 @@ from vn_nav.learning.learner_config import TASKS, TEACHERS
 from vn_nav.learning.log import Log
 from vn_nav.learning.pairs import PairConfig, PairSource, pretrain_pairs
 from vn_nav.learning.precision import fast_dtype
-from vn_nav.learning.presets import TrainConfig
+from vn_nav.learning.presets import GIVEN, TrainConfig
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector, Episode, Rollout
 from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
@@ -33,6 +33,7 @@ from vn_nav.learning.training_state import restore, state_of
 from vn_nav.learning.transfer import SEGMENTATIONS, initial_weights
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.resnet import load_frozen_weights
+from vn_nav.policy.zhu import GivenFeatures
 from vn_nav.policy.zhu_policy import ScenePolicy, build_policy
 from vn_nav.vector_env import GoalLabelsEnv, LabelledEnv, NavigationVectorEnv
 
@@ -69,9 +70,10 @@ class Training:
             self.network = build_policy(config.network(
                 tuple(env.action_names), size, env.robot.moves if config.track_goal else (),
                 self.classes))
-        if config.frozen_weights:
+        if config.frozen_weights and config.frozen_weights != GIVEN:
             assert isinstance(self.network, ScenePolicy)  # no other has a frozen encoder
             load_frozen_weights(self.network.encoder.frozen, config.frozen_weights)
+        _check_given(env, config)
         self.network.to(config.device)
         self.network.compute_dtype = (
             fast_dtype(self.network.device) if config.bf16 is None
@@ -301,3 +303,20 @@ def _label_type(classes: int) -> torch.dtype:
 def _mean(values) -> float:
     values = list(values)
     return sum(values) / len(values) if values else math.nan
+
+
+def _check_given(env: NavigationVectorEnv, config: TrainConfig) -> None:
+    """Whether the scenes bring the features that a network takes.
+
+    Raises:
+        UserError: they do not.
+    """
+    if config.frozen_weights != GIVEN:
+        return
+    features = getattr(env, 'goal_features', None)
+    if features is None or features.shape[-1] != GivenFeatures.features:
+        raise UserError(f'--frozen-weights {GIVEN} needs scenes whose files hold '
+                        f'{GivenFeatures.features} features of each picture',
+                        f'{"no" if features is None else features.shape[-1]} features',
+                        'use grid scenes with the data set resnet_feature, or give a file of '
+                        'weights')

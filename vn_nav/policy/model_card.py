@@ -50,7 +50,8 @@ def model_card(config: dict, parameters: int, size: int) -> str:
 def _describe(network: dict) -> str:
     """A short description of the network."""
     if network['architecture'] == 'icra2017':
-        frozen = {'': 'the small random encoder', 'resnet50': 'ResNet-50'}[network['frozen']]
+        frozen = {'': 'the small random encoder', 'resnet50': 'ResNet-50',
+                  'given': "ResNet-50 in the scenes' files"}[network['frozen']]
         return (f'Zhu et al. 2017 on frozen features of {frozen}; {network["frames"]} stacked '
                 f'frames; layers for {network["scenes"]} scene{"s" * (network["scenes"] > 1)}')
     convolutions = f'convolutions {" / ".join(map(str, network["channels"]))}, picture and goal'

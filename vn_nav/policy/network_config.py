@@ -93,8 +93,8 @@ class NetworkConfig:
                                   and self.architecture != 'icra2017'),
              'a policy with an LSTM has no place cells, or 2 to 1024', self.places),
             (self.pixel_std > 0, 'the deviation of pixels is positive', self.pixel_std),
-            (self.frozen in FROZEN, "the frozen encoder is resnet50, or '' for the small random "
-             'one', self.frozen),
+            (self.frozen in FROZEN, "the frozen encoder is resnet50, '' for the small random one, "
+             'or given: features come with the pictures', self.frozen),
             (self.scenes >= 1, 'there is at least one scene', self.scenes),
             (self.architecture == 'icra2017' or (not self.frozen and self.scenes == 1),
              'a frozen encoder and layers of scenes belong to the architecture icra2017',

@@ -17,6 +17,7 @@ from vn_nav.policy.goal_maps import GoalMaps
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
 from vn_nav.policy.zhu import check_scenes
+from vn_nav.policy.zhu_policy import ScenePolicy
 
 
 def choose(logits: torch.Tensor, decoding: str, generator: torch.Generator) -> torch.Tensor:
@@ -212,15 +213,20 @@ class BatchedPolicy:
         self._filter = make_filter(config.filter_name, config.moves, num_envs)
         self.filtered: tuple[np.ndarray, np.ndarray] | None = None
 
+    def takes_features(self, size: int) -> bool:
+        """Whether frozen features of this size [F] can stand for pictures: icra2017 alone."""
+        return isinstance(self.network, ScenePolicy) and self.network.takes_features(size)
+
     @torch.inference_mode()
     def act(self, obs: dict[str, np.ndarray], goals: np.ndarray, reset_mask: np.ndarray,
             scene: np.ndarray | None = None) -> np.ndarray:
         """Actions [N] int64.
 
         Args:
-            obs: `image` [N,3,S,S] uint8, `goal_index` [N], `last_action` [N], `last_reward` [N].
-            goals: [G,3,S,S] uint8; encoded again only when another array is passed, so do not
-                write into one.
+            obs: `image` [N,3,S,S] uint8, `goal_index` [N], `last_action` [N], `last_reward` [N];
+                `features` [N,F] float32, if somebody has computed them, see `takes_features`.
+            goals: [G,3,S,S] uint8, or their features [G,F] float32; encoded again only when
+                another array is passed, so do not write into one.
             reset_mask: [N] bool, where an episode begins with this observation.
             scene: [N] number of each robot's scene; only for a network with several.
 
@@ -228,9 +234,12 @@ class BatchedPolicy:
             FloatingPointError: the logits are not finite.
             UserError: a scene that the network does not know, or none where it needs one.
         """
-        extras, scenes = None, self.network.config.scenes
+        extras: dict[str, torch.Tensor] = {}
+        scenes = self.network.config.scenes
         if scenes > 1 and scene is not None:
-            extras = {'scene': torch.from_numpy(check_scenes(scene, scenes))[None]}
+            extras['scene'] = torch.from_numpy(check_scenes(scene, scenes))[None]
+        if 'features' in obs and self.takes_features(obs['features'].shape[-1]):
+            extras['features'] = torch.from_numpy(obs['features'])[None]
         if goals is not self._goals:
             self._goals, self._goal_maps = goals, GoalMaps(self.network)
         maps = self._goal_maps.of(torch.from_numpy(goals),
@@ -239,7 +248,7 @@ class BatchedPolicy:
         observation = Observation(
             torch.from_numpy(obs['image'])[None], None, None,
             torch.from_numpy(last_action)[None],
-            torch.from_numpy(np.asarray(obs['last_reward']))[None], extras)
+            torch.from_numpy(np.asarray(obs['last_reward']))[None], extras or None)
         starts = torch.from_numpy(reset_mask)[None]
         output, self._state = self.network(observation, starts, self._state, maps)
         if output.arrival is not None:

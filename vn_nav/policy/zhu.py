@@ -21,7 +21,7 @@ from vn_nav.errors import UserError
 from vn_nav.policy.encoders import add_goals, apply, orthogonal, uniform_by_fan_in
 from vn_nav.policy.resnet import ResNet50
 
-FROZEN = ('', 'resnet50')  # of `NetworkConfig.frozen`
+FROZEN = ('', 'resnet50', 'given')  # of `NetworkConfig.frozen`
 BATCH = 32  # pictures that pass the frozen encoder at a time: large ones need much memory
 
 
@@ -54,6 +54,22 @@ class RandomFeatures(nn.Module):
         return x.flatten(1)
 
 
+class GivenFeatures(nn.Module):
+    """No encoder: the 2048 features of ResNet-50 come with the pictures, out of a scene's file."""
+
+    features = ResNet50.features
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """There is nothing to compute them with.
+
+        Raises:
+            UserError: always.
+        """
+        raise UserError('this network takes the features that the files of its scenes hold',
+                        'pictures alone', 'use it in grid scenes with resnet_feature, or train '
+                        'one with --frozen-weights FILE')
+
+
 class Siamese(nn.Module):
     """Frozen features, the layer that pictures and goal share, and the layer that fuses them.
 
@@ -62,15 +78,16 @@ class Siamese(nn.Module):
     convolutional encoders do it (`vn_nav.policy.encoders`).
 
     Args:
-        frozen: of `FROZEN`: '' the small random one, or 'resnet50'.
+        frozen: of `FROZEN`: '' the small random one, 'resnet50', or 'given' (`GivenFeatures`).
         frames: K; width: H.
     """
 
     def __init__(self, frozen: str, frames: int, width: int):
         super().__init__()
         self.frames, self.features = frames, width
-        self.frozen: ResNet50 | RandomFeatures = (
-            ResNet50() if frozen == 'resnet50' else RandomFeatures())
+        self.frozen: ResNet50 | RandomFeatures | GivenFeatures = (
+            ResNet50() if frozen == 'resnet50' else
+            GivenFeatures() if frozen == 'given' else RandomFeatures())
         self.shared = nn.Linear(frames * self.frozen.features, width)
         self.fuse = nn.Linear(2 * width, width)
         for layer in (self.shared, self.fuse):

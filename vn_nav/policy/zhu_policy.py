@@ -58,6 +58,10 @@ class ScenePolicy(Policy):
         return torch.zeros(batch, self.config.frames - 1, self.encoder.frozen.features,
                            device=self.device)
 
+    def takes_features(self, size: int) -> bool:
+        """Whether features of this size [F] can stand for pictures."""
+        return size == self.encoder.frozen.features
+
     def _frames(self, obs: Observation) -> Tensor:
         known = (obs.extras or {}).get('features')
         return self.look(obs.image) if known is None else known

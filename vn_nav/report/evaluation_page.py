@@ -14,14 +14,16 @@ from vn_nav.evaluation.evaluator import ARRIVAL, BLANK, DECLARED, RANDOM, WRONG,
 from vn_nav.evaluation.metrics import Episode
 from vn_nav.report.maps import Journey, floor_map
 from vn_nav.report.page import cards, page
-from vn_nav.report.tables import SPLITS, TITLES, number, rows_html, scenes_html
+from vn_nav.report.tables import SPLITS, TITLES, number, rows_html, scenes_html, unit
 
 MAPS = 6  # of a split, unless the user asks for another number
 DEFINITIONS = f"""<h2>Definitions</h2><dl>
 <dt>Arrival</dt><dd>The simulator ends an episode as soon as the robot stands, at the end of a
 decision, within {ARRIVAL_RADIUS:g} m of the goal (driving distance) and faces within
 {math.degrees(ARRIVAL_HEADING):g} degrees of the picture's
-direction. That is success. (Other tasks than pictures of places have rules of their own.)</dd>
+direction. That is success. On a grid it stands in the very cell and faces the very way, and
+distances are steps: moves and turns. (Other tasks than pictures of places have rules of their
+own.)</dd>
 <dt>Declared stop</dt><dd>The robot has to declare arrival. Success needs arrival at that
 moment; a false stop ends the episode. <i>Declared</i> and <i>false stops</i> are shares of
 episodes; <i>reached</i> is the share in which the robot was at its goal at some time.</dd>
@@ -81,7 +83,7 @@ def _split(name: str, split: dict, rows: Rows, plans: dict[str, dict | None], re
               'looks; crosses: contacts.</p>' if chosen else '')
     return f"""<h2>{html.escape(SPLITS.get(name, name))}</h2>
 <p class="soft">{where}, {own['episodes']} episodes a row, mean start
-distance {number(own['start_distance'], '.1f')} m.</p>
+distance {number(own['start_distance'], '.1f')} {unit(own)}.</p>
 {_cards(split['rows'][headline], headline)}
 {tables}
 {each}
@@ -150,8 +152,8 @@ def _map(episode: Episode, plan: dict, limit: int, bag: str | None) -> str:
              else f'at the limit of {limit} decisions')
     to = 'To the' if bag else f'{html.escape(episode.scene)}, to the'
     shortest = ('' if math.isnan(episode.start_distance) else
-                f' for a shortest way of {episode.start_distance:.1f} m')
+                f' for a shortest way of {episode.start_distance:.1f} {episode.unit}')
     return f"""<figure>{drawn}<figcaption>{to}
 {html.escape(episode.goal)}: <span class="{kind}">{outcome(episode)}</span> {after},
-{episode.path_length:.1f} m{shortest}; end
-{episode.stop_distance:.1f} m from the goal</figcaption></figure>"""
+{episode.path_length:.1f} {episode.unit}{shortest}; end
+{episode.stop_distance:.1f} {episode.unit} from the goal</figcaption></figure>"""

@@ -26,7 +26,7 @@ COLUMNS: tuple[Column, ...] = (
     ('seconds', lambda r: f'{r["seconds"]:.0f}'),
     ('collisions', lambda r: f'{r["collisions"]:.1%}'),
     ('contact-free', lambda r: f'{r["contact_free_success"]:.2f}'),
-    ('stop error', lambda r: f'{r["stop_error_m"]:.2f} m {r["stop_error_deg"]:.0f} deg'),
+    ('stop error', lambda r: f'{stop_error(r)} {r["stop_error_deg"]:.0f} deg'),
     ('return', lambda r: f'{r["return"]:.2f}'),
 )
 STOP_COLUMNS: tuple[Column, ...] = (
@@ -45,6 +45,17 @@ FILTER_COLUMNS: tuple[Column, ...] = (  # where a row has an action filter
 def number(value: float | None, form: str) -> str:
     """A figure, or a dash where there is none."""
     return '-' if value is None else f'{value:{form}}'
+
+
+def unit(figures: dict) -> str:
+    """Of a summary's distances: 'm', or 'steps' on a grid."""
+    return 'm' if 'stop_error_m' in figures else 'steps'
+
+
+def stop_error(figures: dict) -> str:
+    """The distance at the end of episodes, in words."""
+    name = unit(figures)
+    return f'{figures[f"stop_error_{name}"]:.2f} {name}'
 
 
 def place(split: str, scenes: Sequence[str], bag: str | None = None) -> str:

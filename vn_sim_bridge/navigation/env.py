@@ -23,7 +23,13 @@ from vn_sim_bridge.floor.contacts import motion_noise
 from vn_sim_bridge.floor.floor_map import CELL
 from vn_sim_bridge.floor.places import have_floors, walled, with_rooms
 from vn_sim_bridge.navigation import tasks
-from vn_sim_bridge.navigation.env_config import EnvConfig, check_simulator, objects_of, setup_for
+from vn_sim_bridge.navigation.env_config import (
+    EnvConfig,
+    check_simulator,
+    objects_of,
+    setup_for,
+    with_own_actions,
+)
 from vn_sim_bridge.navigation.episodes import draw_grip, draw_motion_scale, draw_variant
 from vn_sim_bridge.navigation.explorer import Explorer
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
@@ -31,7 +37,7 @@ from vn_sim_bridge.navigation.oracle import FloorOracle, turning_table
 from vn_sim_bridge.navigation.own_objects import OwnObjectGoal
 from vn_sim_bridge.navigation.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.simulator import Frames, Motion, Simulator
-from vn_sim_bridge.simulators import open_simulator
+from vn_sim_bridge.simulators import open_simulator, robot_for
 
 SQUARE = 1.0  # m, side of the squares of floor that exploration counts
 BATCH = 256  # goal pictures drawn at a time: few need little memory
@@ -62,7 +68,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     Args:
         config: what to simulate.
-        robot: actions, camera and footprint; the standard robot if left out.
+        robot: actions, camera and footprint; left out: the scenes' own, which is the standard
+            robot wherever they do not say.
         threads: threads that draw.
         simulator: robots and places instead of the configuration's scenes: as many robots, and
             pictures as large, as the configuration says. It is closed with the environment.
@@ -75,8 +82,11 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     def __init__(self, config: EnvConfig | None = None, robot: RobotSpec | None = None, *,
                  threads: int = 1, simulator: Simulator | None = None):
-        self.config = config = config or EnvConfig()
-        self.robot = (robot or RobotSpec()).with_actions(config.actions)
+        config = config or EnvConfig()
+        if robot is None:
+            robot = RobotSpec() if simulator else robot_for(config.scenes)
+        self.config = config = with_own_actions(config, robot)
+        self.robot = robot.with_actions(config.actions)
         self.num_envs = n = config.num_envs
         self.simulator: Simulator = simulator or open_simulator(
             config.scenes, setup_for(config, self.robot, threads))
@@ -98,6 +108,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._deltas = np.array([[a.dx, a.dy, a.dyaw, a.dpitch] for a in self.robot.actions])
         self._sizes = np.array([abs(action.size) for action in self.robot.actions])
         self._make_goals()
+        self.goal_features = self._make_goal_features()
         self._make_spaces()
         self._tau = 1.0
         self._mode = RIGHT
@@ -198,13 +209,25 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                 self._goal_points[part] = lift(frames.depth,
                                                *self.simulator.cameras(poses, appearance))
 
+    def _make_goal_features(self) -> np.ndarray | None:
+        """Frozen features [G,F] of the goals, if the simulator knows any; of a blank one zeros."""
+        if not self.simulator.feature_size:
+            return None
+        rows = self.simulator.features(np.array([view.place for view in self.task.views]),
+                                       self.goal_poses)
+        return np.concatenate([np.repeat(rows, self._variants, axis=0),
+                               np.zeros((1, rows.shape[1]), np.float32)])
+
     def _make_spaces(self) -> None:
         size, actions = self.config.size, len(self.action_names)
+        features = {'features': spaces.Box(-np.inf, np.inf, (self.simulator.feature_size,),
+                                           np.float32)} if self.simulator.feature_size else {}
         self.single_observation_space = spaces.Dict({
             'image': spaces.Box(0, 255, (3, size, size), np.uint8),
             'goal_index': spaces.Discrete(len(self.goals)),
             'last_action': spaces.Discrete(actions + 1, start=-1),
             'last_reward': spaces.Box(-np.inf, np.inf, (), np.float32),
+            **features,
         })
         self.single_action_space = spaces.Discrete(self._choices)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -214,6 +237,11 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def _choices(self) -> int:
         """Numbers that `step` takes."""
         return len(self.action_names) + (self.declare_action is not None)
+
+    @property
+    def distance_unit(self) -> str:
+        """Of distances and of the length of a path: 'm', or 'steps' (decisions)."""
+        return 'steps' if self.simulator.capabilities.steps else 'm'
 
     @property
     def _judges_poses(self) -> bool:
@@ -391,16 +419,16 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._last_action[driving] = actions[driving]
         self._last_reward[acting] = verdict.reward[acting]
         terminated = ended | declared
-        lost = np.zeros(self.num_envs, bool)
-        if motion is not None and motion.truncated is not None:
-            lost[driving] = motion.truncated
-        truncated = ~terminated & ~reset & (lost | (self._step >= self.config.max_decisions))
+        broken = self.simulator.broken_off()  # while an episode begins: it begins all the same
+        truncated = ~terminated & ~reset & (broken | (self._step >= self.config.max_decisions))
         self._done = terminated | truncated
         observation, info = self._result(frames, reset, verdict.success, collided)
         return observation, reward, terminated, truncated, info
 
     def _drive(self, actions: np.ndarray, acting: np.ndarray) -> Motion:
         """Move some robots. On a grid nothing is noisy, slips or is worn."""
+        if self.simulator.capabilities.own_actions:
+            return self.simulator.act(actions, acting)
         delta = self._deltas[actions]
         continuous = self.simulator.capabilities.continuous
         if self.config.noise and continuous:
@@ -410,7 +438,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if continuous:
             delta = self._as_driven(delta, acting)
         motion = self.simulator.move(delta, acting)
-        self._path_length[acting] += np.hypot(motion.delta[:, 0], motion.delta[:, 1])
+        self._path_length[acting] += (1.0 if self.simulator.capabilities.steps else np.hypot(
+            motion.delta[:, 0], motion.delta[:, 1]))
         return motion
 
     def _as_driven(self, delta: np.ndarray, env_ids: np.ndarray) -> np.ndarray:
@@ -477,10 +506,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     def _measure(self, env_ids: np.ndarray) -> None:
         """Geodesic distance of robots to their goals; 0 where the task has none."""
         if self.config.task != 'collect':
-            self._distance[env_ids] = self._distance_of(env_ids, self.simulator.poses[env_ids, :2])
+            self._distance[env_ids] = self._distance_of(env_ids, self.simulator.poses[env_ids])
 
-    def _distance_of(self, env_ids: np.ndarray, xy: np.ndarray) -> np.ndarray:
-        return self._distances.at(env_ids, self.place_index[env_ids], xy)
+    def _distance_of(self, env_ids: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        return self._distances.at(env_ids, self.place_index[env_ids], poses)
 
     def _distance_from(self, env: int, xy: np.ndarray) -> np.ndarray:
         """Of positions [K,2] m in the place of one robot to its goal, [K] m."""
@@ -507,6 +536,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'last_action': self._last_action.copy(),
             'last_reward': self._last_reward.copy(),
         }
+        if self.simulator.feature_size:
+            observation['features'] = self.simulator.features(self.place_index,
+                                                              self.simulator.poses)
         info = {
             'reset': reset,
             'success': success,

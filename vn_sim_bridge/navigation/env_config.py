@@ -7,7 +7,7 @@ from collections.abc import Collection
 from typing import Any
 
 from vn_nav.errors import UserError
-from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
+from vn_nav.robot import DRIVE_ACTIONS, NamedAction, RobotSpec
 from vn_nav.scenes import one_simulator
 from vn_sim_bridge.floor.places import have_floors
 from vn_sim_bridge.navigation.episodes import MIN_START_DISTANCE
@@ -82,6 +82,18 @@ class EnvConfig:
     def pictures_per_goal(self) -> int:
         """Differently lit pictures kept of each goal."""
         return self.goal_variants or self.randomisation.pictures_per_goal
+
+
+def with_own_actions(config: EnvConfig, robot: RobotSpec) -> EnvConfig:
+    """The configuration with a robot's actions, where it has none of the usual ones.
+
+    A simulator with actions of its own (`Capabilities.own_actions`) is asked for all of them,
+    unless some are named.
+    """
+    own = all(isinstance(action, NamedAction) for action in robot.actions)
+    if own and config.actions == DRIVE_ACTIONS:
+        return dataclasses.replace(config, actions=robot.action_names)
+    return config
 
 
 def setup_for(config: EnvConfig, robot: RobotSpec, threads: int = 1) -> Setup:
@@ -170,6 +182,9 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
          config.task),
         (config.stop == 'arrival' or not can.rewards,
          'a simulator that pays itself ends its episodes', config.stop),
+        (can.own_actions == all(isinstance(action, NamedAction) for action in robot.actions),
+         'a simulator with actions of its own takes those, and no other takes such ones',
+         robot.action_names),
         (can.geodesic or not config.progress_reward,
          'progress_reward needs a simulator that knows ways', config.progress_reward),
         (can.geodesic or simulator.planner or 'oracle_action' not in told,

@@ -62,7 +62,7 @@ class Starts:
 
     def __init__(self, place: Place, field: Distance, min_distance: float):
         cells, headings = place.starts()
-        distance = field.at(cells)
+        distance = field.at(cells if headings is None else np.column_stack([cells, headings]))
         keep = np.isfinite(distance) & (distance >= min_distance)
         if not keep.any():
             keep = np.isfinite(distance)

@@ -203,6 +203,7 @@ class WarpNavigationEnv:
         return self._state['house']
 
     restorable = True  # see `NavigationEnv.restorable`
+    distance_unit = 'm'  # see `NavigationEnv.distance_unit`
 
     def close(self) -> None:
         """The arrays go with this object: there is nothing else to release."""

@@ -42,7 +42,7 @@ class Episode:
     index: int
     goal: int  # index into the goals; -1: a goal by pose
     start: tuple[float, ...]  # x, y, yaw, pitch
-    start_distance: float | None  # m, geodesic; None: nobody knows the ways
+    start_distance: float | None  # m, geodesic; None: nobody knows it
     begun_at: float  # s, simulated
     decisions: int = 0
     collisions: int = 0  # decisions that touched something
@@ -78,7 +78,7 @@ class SimulatedRobot:
 
     Raises:
         UserError: a goal where the robot cannot stand; a simulator that is no robot's world: its
-            robots cannot be put anywhere, or drive by whole actions.
+            robots cannot be put anywhere, or its actions are no motions.
     """
 
     def __init__(self, scene: str, *, robot: RobotSpec, size: int = 84,
@@ -100,6 +100,9 @@ class SimulatedRobot:
         self.fields = (
             [GoalField(self.place, goal, MIN_START_DISTANCE) for goal in self.place.goals]
             if goal_poses is None else [self._field_at(*pose) for pose in goal_poses])
+        # On a grid nothing is noisy, slips or is worn.
+        self._exact = not self.simulator.capabilities.continuous
+        self.noise = noise and not self._exact
         self._nominal = nominal_sizes(robot)
         self.tick_count = 0
         self.odometry_drift = odometry_drift
@@ -119,8 +122,8 @@ class SimulatedRobot:
     def _check_simulator(self, scene: str) -> None:
         can = self.simulator.capabilities
         rules = (
-            (can.continuous and can.teleport, 'a robot that is driven by velocities needs a '
-             'simulator of continuous motion that puts it anywhere'),
+            (can.teleport and not can.own_actions, 'a robot that is driven by velocities needs a '
+             'simulator of motions that puts it anywhere'),
             (not can.rewards, 'the bridge judges arrival itself: no simulator that pays'),
             (can.appearance or not self.randomisation.varies_pictures,
              'light and camera vary in simulators that draw them: randomisation none'),
@@ -173,9 +176,11 @@ class SimulatedRobot:
         self.simulator.apply_appearance(np.array([0]), self.seed, Stream.APPEARANCE, index, 0)
         self._motion_scale = float(draw_motion_scale(self.randomisation, *counter))
         self._shown = None
+        can = self.simulator.capabilities
+        # Steps are no metres: who reads `start_distance` makes figures in metres of it.
+        known = can.geodesic and not can.steps
         self.episode = Episode(index, chosen, tuple(float(v) for v in start),
-                               self.distance() if self.simulator.capabilities.geodesic else None,
-                               self.time)
+                               self.distance() if known else None, self.time)
         return self.episode
 
     def place_freely(self, index: int) -> None:
@@ -216,8 +221,8 @@ class SimulatedRobot:
         return self._shown
 
     def distance(self) -> float:
-        """Geodesic distance to the goal [m]."""
-        return float(self._field.field.at(self.pose[None, :2])[0])
+        """Geodesic distance to the goal [m; steps on a grid]."""
+        return float(self._field.field.at(self.pose[None])[0])
 
     def drive(self, command: np.ndarray) -> Decision | None:
         """Advance by one tick as the base follows a command, within the robot's limits.
@@ -253,7 +258,7 @@ class SimulatedRobot:
             return self.end_decision() if self._in_decision else None
         if not self._in_decision:
             self._in_decision = True
-            self._share = self._motion_scale * self._slip()
+            self._share = 1.0 if self._exact else self._motion_scale * self._slip()
         wanted = self.velocity * TICK
         delta = self._with_noise(wanted) if self.noise else wanted.copy()
         delta[:3] *= self._share

@@ -15,9 +15,12 @@ import dataclasses
 import importlib
 import importlib.metadata
 import importlib.util
+import subprocess
+import sys
 from collections.abc import Sequence
 
 from vn_nav.errors import UserError
+from vn_nav.robot import RobotSpec
 from vn_nav.scenes import one_simulator
 from vn_sim_bridge.simulator import BaseSimulator, Setup, Simulator
 
@@ -33,6 +36,8 @@ class Entry:
     scene: str  # an example of a scene's name
     needs: tuple[str, ...] = ()  # modules that are not always installed
     install: str = ''  # the command that installs them
+    pip: tuple[str, ...] = ()  # what `vn_nav simulators install` asks pip for
+    setup: str = ''  # or a module with `missing()` and `install(system)`, where pip will not do
 
 
 TABLE = {
@@ -46,6 +51,15 @@ TABLE = {
     'thor': Entry('vn_sim_bridge.simulators.thor',
                   'AI2-THOR, drawn by Unity', 'thor:FloorPlan227', ('ai2thor',),
                   "pip install 'vn_nav[thor]'"),
+    'procthor': Entry('vn_sim_bridge.simulators.procthor',
+                      'houses of ProcTHOR, with boxes where there are no meshes',
+                      'procthor:house.json'),
+    'dmlab': Entry('vn_sim_bridge.simulators.dmlab', 'DeepMind Lab: arena, mazes, a house, levels',
+                   'dmlab:maze?seed=3', install='vn_nav simulators install dmlab',
+                   setup='vn_sim_bridge.dmlab.install'),
+    'grid': Entry('vn_sim_bridge.simulators.thor_grid',
+                  'grids of pictures: dumps of AI2-THOR, and of other scenes',
+                  'grid:bathroom_02?goals=26,37', ('h5py',), "pip install 'vn_nav[grid]'"),
     'suncg': Entry('vn_sim_bridge.simulators.suncg',
                    "houses in SUNCG's format, drawn by this package", 'suncg:HOUSE_ID?level=0',
                    ('PIL',), 'pip install "vn_nav[mesh]"'),
@@ -53,9 +67,6 @@ TABLE = {
                      "a user's own House3D (not tried against the real one)",
                      'house3d:HOUSE_ID', ('House3D',),
                      'build House3D and put its folder on PYTHONPATH; or use suncg:'),
-    'procthor': Entry('vn_sim_bridge.simulators.procthor',
-                      'houses of ProcTHOR, with boxes where there are no meshes',
-                      'procthor:house.json'),
 }
 
 
@@ -70,7 +81,34 @@ def table() -> dict[str, Entry]:
 
 def missing(entry: Entry) -> list[str]:
     """What a simulator needs and this machine lacks."""
-    return [name for name in entry.needs if importlib.util.find_spec(name) is None]
+    lacking = [name for name in entry.needs if importlib.util.find_spec(name) is None]
+    return lacking + (importlib.import_module(entry.setup).missing() if entry.setup else [])
+
+
+def install(name: str, *, system: bool = False) -> str:
+    """Install what a simulator needs; what was done, in a line.
+
+    Args:
+        name: of a row of the table.
+        system: also Debian packages, as root.
+
+    Raises:
+        UserError: there is no such row, or something could not be installed.
+    """
+    entry = table().get(name)
+    if entry is None or not (entry.pip or entry.setup):
+        able = ', '.join(row for row, entry in table().items() if entry.pip or entry.setup)
+        raise UserError(f'a simulator that is installed by this command is one of: {able}', name,
+                        'choose one (vn_nav simulators)')
+    if entry.setup:
+        return importlib.import_module(entry.setup).install(system)
+    command = [sys.executable, '-m', 'pip', 'install', '-qq', '--disable-pip-version-check',
+               *entry.pip]
+    if subprocess.run(command).returncode:
+        raise UserError(f'pip installs {" ".join(entry.pip)}', 'it failed, see above',
+                        'correct it and try again')
+    importlib.invalidate_caches()
+    return f'{name}: {" ".join(entry.pip)}'
 
 
 def simulator_class(name: str) -> type[BaseSimulator]:
@@ -102,6 +140,18 @@ def simulator_class(name: str) -> type[BaseSimulator]:
     except AttributeError as error:
         raise UserError(f'the module {module} has a class SIMULATOR', str(error),
                         'name one on BaseSimulator so') from error
+
+
+def robot_for(scenes: Sequence[str], robot: RobotSpec | None = None) -> RobotSpec:
+    """A robot for some scenes, all of one simulator: the given one, or the scenes' own.
+
+    Raises:
+        UserError: scenes of several simulators, or one that there is not.
+    """
+    if robot is not None:
+        return robot
+    name, parsed = one_simulator(scenes)
+    return simulator_class(name).own_robot(parsed, RobotSpec())
 
 
 def open_simulator(scenes: Sequence[str], setup: Setup) -> Simulator:

@@ -72,6 +72,7 @@ class ThorSimulator(BaseSimulator):
         self.version = f'ai2thor-{importlib.metadata.version("ai2thor")}'
         self.shuffle = shuffle or bool(setup.models)  # a task that looks for objects
         robot, count = setup.robot, setup.num_envs
+        self._lost = np.zeros(count, bool)  # since `broken_off` was last asked
         self.agents = [Agent(setup.size, robot.camera_fov, robot.camera_pitch, arm=arm)
                        for _ in range(count)]
         self._pool = ThreadPoolExecutor(count, 'thor')
@@ -130,14 +131,19 @@ class ThorSimulator(BaseSimulator):
         self.poses[env_ids] = poses
 
     def move(self, delta: np.ndarray, env_ids: np.ndarray | None = None) -> Motion:
-        """See `Simulator`. A robot whose engine was lost stands where it stood: truncated."""
+        """See `Simulator`. A robot whose engine was lost stands where it stood."""
         env_ids = self._all if env_ids is None else np.asarray(env_ids)
         rows = dict(zip(map(int, env_ids), delta, strict=True))
         moves = self._each(rows, lambda n: self.agents[n].move(rows[n]))
         self.poses[env_ids] = [self.agents[n].pose for n in env_ids]
+        self._lost[env_ids] |= [move.lost for move in moves]
         return Motion(np.array([move.delta for move in moves]).reshape(-1, 4),
-                      np.array([move.collided for move in moves], bool),
-                      truncated=np.array([move.lost for move in moves], bool))
+                      np.array([move.collided for move in moves], bool))
+
+    def broken_off(self) -> np.ndarray:
+        """See `Simulator`: the engine was lost in a move, and replaced."""
+        lost, self._lost = self._lost, np.zeros(self.num_envs, bool)
+        return lost
 
     def observe(self, env_ids: np.ndarray | None = None, keys: np.ndarray | None = None) -> Frames:
         """See `Simulator`."""

@@ -137,6 +137,9 @@ def _client():
     class Pipes(FifoServer):
         """The client's pipes; every wait ends when the engine does."""
 
+        server_pipe: Any  # of FifoServer, which may not be installed where types are checked
+        client_pipe: Any
+
         def _recv_message(self, timeout):
             if self.server_pipe is None:  # opening does not wait for the engine
                 fd = os.open(self.server_pipe_path, os.O_RDONLY | os.O_NONBLOCK)
