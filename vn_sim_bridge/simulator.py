@@ -181,6 +181,7 @@ class Simulator(Protocol):
     capabilities: Capabilities
     objects: Objects
     planner: Planner | None  # None: a robot can turn anywhere, so distances will do
+    room_objects: Mapping[str, Sequence[str]] | None  # see `BaseSimulator`
 
     @property
     def label_names(self) -> Sequence[str]:
@@ -301,6 +302,8 @@ class BaseSimulator(abc.ABC):
     # Names of movable objects, by task: `object` goes to one of them, in `collect` the first is
     # worth 1 and the second -1. Of simulators with `placeable_objects`; `Setup.models` has them.
     task_objects: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    # Classes that tell a room's type, by type; None: those of `tasks.ROOM_OBJECTS`.
+    room_objects: Mapping[str, Sequence[str]] | None = None
     splits: ClassVar[Mapping[str, Sequence[str]]] = {}  # names of scenes by the split's name
     planner: Planner | None = None
     places: Sequence[Place]

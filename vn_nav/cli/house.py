@@ -26,6 +26,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                                 'or a YAML file')
         if out:
             action.add_argument('--out', type=Path, help=f'file (default house-SEED.{out})')
+        if name == 'export':
+            action.add_argument('--suncg', type=Path, metavar='DIR', help="write it in SUNCG's "
+                                'format into this folder instead (simulator suncg)')
+            action.add_argument('--house3d', action='store_true', help='with --suncg: also the '
+                                'house.obj that House3D reads')
         action.set_defaults(run=run)
 
 
@@ -66,6 +71,12 @@ def _export(args: argparse.Namespace) -> int:
     from vn_sim_bridge.houses.mesh_export import export_mesh
     from vn_sim_bridge.houses.procedural import generate_house
     house = generate_house(args.seed, rooms=args.rooms)
+    if args.suncg is not None:
+        from vn_sim_bridge.suncg.export import export_suncg
+        name = export_suncg(house, args.suncg, converted=args.house3d)
+        print(f'{args.suncg}: house {name}, {len(house.rooms)} rooms; '
+              f'export SUNCG_PATH={args.suncg}, scene suncg:{name}')
+        return 0
     path = args.out or Path(f'house-{args.seed}.glb')
     export_mesh(house.scene, path)
     print(f'{path}: {house.scene.triangle_count} triangles, {path.stat().st_size / 1e6:.1f} MB, '

@@ -40,7 +40,7 @@ def export_mesh(scene: Scene, path: str | Path) -> None:
         parts.setdefault(key, []).append(face)
     for number, ((label, instance, texture, colour), faces) in enumerate(parts.items()):
         out.part(f'{LABELS[label]}_{instance}_{number}', f'{LABELS[label]}_{number}',
-                 *_triangles(scene, faces), textures[texture], colour)
+                 *triangles_of_faces(scene, faces), textures[texture], colour)
     try:
         path.write_bytes(out.bytes())
     except OSError as error:
@@ -106,7 +106,8 @@ class _Glb:
                 + struct.pack('<I4s', len(self.data), b'BIN\0') + self.data)
 
 
-def _triangles(scene: Scene, faces: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def triangles_of_faces(scene: Scene, faces: list[int]
+                       ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points [V,3], texture coordinates [V,2] (v downwards) and triangles [T,3] of some faces."""
     points, triangles, uv, count = [], [], [], 0
     for face in faces:

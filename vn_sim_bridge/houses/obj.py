@@ -316,4 +316,8 @@ def _part(path: Path, names: tuple, faces: _Faces, vertices: np.ndarray, uv: np.
             raise UserError('texture coordinates are finite', where, 'repair the mesh')
         own[..., 1] = 1.0 - own[..., 1]  # v points up in OBJ
         picture, own = unwrap(material.picture, own, (material.wrap,) * 2, where)
+    elif (index[:, 1] >= 0).all():  # for whoever puts another material on it
+        own = uv[chosen[..., 1]] * (1, -1) + (0, 1)
+        if not np.isfinite(own).all():
+            own = None
     return Part(names, vertices[chosen[..., 0]], own, colour, picture, True)

@@ -175,7 +175,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if config.task == 'room':
             return tasks.RoomGoal(list(map(with_rooms, self.places)), config.num_envs,
                                   must_see=config.room_must_see, min_distance=distance,
-                                  label_names=self.label_names)
+                                  label_names=self.label_names,
+                                  room_objects=self.simulator.room_objects)
         return tasks.Collect(self.places, config.num_envs, models=models, objects=config.objects)
 
     def _make_goals(self) -> None:

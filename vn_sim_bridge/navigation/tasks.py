@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -76,17 +76,23 @@ def shaping_reward(before, after, collided, success=False, *, progress: float, c
             + np.where(success, goal, step)).astype(np.float32)
 
 
-def room_classes(label_names: Sequence[str], kind: str) -> list[int]:
+def room_classes(label_names: Sequence[str], kind: str,
+                 objects: Mapping[str, Sequence[str]] = ROOM_OBJECTS) -> list[int]:
     """The classes that tell a room's type.
+
+    Args:
+        label_names: of the pictures.
+        kind: of the room.
+        objects: names of classes by type.
 
     Raises:
         UserError: a type that nobody knows objects of, or no object of it has a class.
     """
-    wanted = ROOM_OBJECTS.get(kind, ())
+    wanted = objects.get(kind, ())
     found = [label for label, name in enumerate(label_names) if name in wanted]
     if not found:
         raise UserError('room_must_see needs classes of objects that tell the type of a room: '
-                        + (', '.join(wanted) or f'it knows {", ".join(ROOM_OBJECTS)}'),
+                        + (', '.join(wanted) or f'it knows {", ".join(objects)}'),
                         kind, 'leave out room_must_see, or name the classes so')
     return found
 
@@ -264,10 +270,15 @@ class RoomGoal(_Pool):
         must_see: also require the rule of House3D's code: at least 4.5 % of the picture shows the
             room's objects, two decisions in a row.
         label_names: behind the labels that a robot sees; for `must_see` alone.
+        room_objects: names of classes by type of room, likewise.
+
+    Raises:
+        UserError: a place without a room to go to. The kind '' is of rooms that are none.
     """
 
     def __init__(self, places: Sequence[RoomPlace], num_envs: int, *, must_see: bool,
-                 min_distance: float, label_names: Sequence[str] = ()):
+                 min_distance: float, label_names: Sequence[str] = (),
+                 room_objects: Mapping[str, Sequence[str]] | None = None):
         super().__init__()
         self.must_see = must_see
         self.kinds: list[str] = []  # of each view
@@ -278,13 +289,21 @@ class RoomGoal(_Pool):
         for index, place in enumerate(places):
             by_kind: dict[str, list] = {}
             for room in place.rooms:
-                by_kind.setdefault(room.kind, []).append(room)
+                if room.kind:
+                    by_kind.setdefault(room.kind, []).append(room)
+            shown = {goal.room for goal in place.goals}
             rows = [(kind, rooms, goal) for kind, rooms in by_kind.items()
-                    for goal in place.goals if goal.room == rooms[0].name]
+                    for goal in place.goals
+                    # of the first one that the robot can get into
+                    if goal.room == next((r.name for r in rooms if r.name in shown), None)]
+            if not rows:
+                raise UserError('task room needs rooms of a type to go to', f'{place.name}: none',
+                                'choose another scene')
             self.ranges.append((len(self.views), len(rows)))
             for kind, rooms, goal in rows:
                 if must_see and kind not in self.classes:
-                    self.classes[kind] = room_classes(label_names, kind)
+                    self.classes[kind] = room_classes(label_names, kind,
+                                                      room_objects or ROOM_OBJECTS)
                 self.views.append(View(index, goal.pose, kind.replace('_', ' ')))
                 self.kinds.append(kind)
                 self.inside.append(tuple(room.rect for room in rooms))

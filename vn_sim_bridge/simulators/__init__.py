@@ -67,6 +67,13 @@ TABLE = {
     'gym': Entry('vn_sim_bridge.simulators.gymnasium_env',
                  'Gymnasium environments with pictures and discrete actions',
                  'gym:MiniWorld-Hallway-v0'),
+    'suncg': Entry('vn_sim_bridge.simulators.suncg',
+                   "houses in SUNCG's format, drawn by this package", 'suncg:HOUSE_ID?level=0',
+                   ('PIL',), 'pip install "vn_nav[mesh]"'),
+    'house3d': Entry('vn_sim_bridge.simulators.house3d',
+                     "a user's own House3D (not tried against the real one)",
+                     'house3d:HOUSE_ID', ('House3D',),
+                     'build House3D and put its folder on PYTHONPATH; or use suncg:'),
 }
 
 

@@ -1,0 +1,1 @@
+"""Houses in SUNCG's format: read, labelled, and written from our own."""
