@@ -17,7 +17,8 @@ from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.recorded.image_graph import KEPT, build_graph
-from vn_sim_bridge.recorded.pose_lattice import GAP, HEADING, TURNED_MOST, _components
+from vn_sim_bridge.recorded.lattice_graph import components
+from vn_sim_bridge.recorded.open_poses import GAP, HEADING, TURNED_MOST
 from vn_sim_bridge.simulators.house import HouseSimulator
 from vn_sim_bridge.simulators.recorded import RecordedSimulator, turned
 from vn_sim_bridge.teach_place import held_out, make_env, make_pairs
@@ -209,7 +210,7 @@ def test_components_are_those_of_a_search():
         reach = np.eye(count, dtype=bool)
         for _ in range(count):
             reach = reach | reach[to].any(axis=1)
-        number = _components(to)
+        number = components(to)
         assert np.array_equal(number[:, None] == number[None, :], reach & reach.T)
 
 
