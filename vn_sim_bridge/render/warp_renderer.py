@@ -15,8 +15,9 @@ import numpy as np
 import warp as wp
 
 from vn_sim_bridge.render.pack import pack_scenes
-from vn_sim_bridge.render.rasterizer import BLOCK, LAST_NODE, NEAR
 from vn_sim_bridge.render.scene import MAX_CORNERS, Scene
+from vn_sim_bridge.render.shading import BLOCK, LAST_NODE
+from vn_sim_bridge.render.visibility import NEAR
 
 BAND = 16  # rows that one thread scan-converts
 _near = wp.constant(wp.float64(NEAR))
