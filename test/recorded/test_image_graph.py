@@ -322,11 +322,16 @@ def test_depth_of_the_bag_measures_the_overlap():
     assert info['depth'].dtype == np.float32
     env.simulator.place(np.arange(2), env.goal_poses[info['goal']])
     env.simulator._draw = False
-    assert (env._overlap(env.simulator.observe().depth) > 0.95).all()
+
+    def shares(env):
+        return env._views.co_visibility(env._picture, env._shown_goal,
+                                        env.simulator.observe().depth)
+
+    assert (shares(env) > 0.95).all()
     away = env.goal_poses[info['goal']].copy()
     away[:, 2] = wrap_angle(away[:, 2] + math.pi)
     env.simulator.place(np.arange(2), away)
-    assert (env._overlap(env.simulator.observe().depth) < 0.1).all()
+    assert (shares(env) < 0.1).all()
 
 
 @pytest.mark.parametrize('options', [
