@@ -147,7 +147,7 @@ RESIZES = ('resize', 'interpolate', 'grid_sample', 'Upsample')
 # Functions that resize pictures: of cameras, of textures, for people, for frozen features, and to
 # tell a black or frozen camera.
 MAY_RESIZE = {
-    'vn_nav/observation.py', 'vn_sim_bridge/render/scene.py', 'vn_sim_bridge/houses/textures.py',
+    'vn_nav/observation.py', 'vn_sim_bridge/render/scene.py', 'vn_sim_bridge/houses/materials.py',
     'vn_sim_bridge/tools/contact_sheet.py', 'vn_sim_bridge/tools/walk.py',
     'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor/content_checks.py',
     'vn_nav/bags/report/figures.py',  # thumbnails for a page

@@ -275,7 +275,7 @@ class Simulator(Protocol):
         """
 
     def broken_off(self) -> np.ndarray:
-        """[N] bool: whose episode broke off since the last call, by a crash for instance.
+        """[N] bool: whose episode broke off since the last call: a crash, a limit of its own.
 
         Such a robot can go on, but not in that episode: it is truncated.
         """

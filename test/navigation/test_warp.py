@@ -126,7 +126,9 @@ def test_observations_share_the_devices_memory():
                               device='cpu')
 
 
-@pytest.mark.parametrize('module', ['vn_sim_bridge.render.warp_renderer',
+@pytest.mark.parametrize('module', ['vn_sim_bridge.render.warp_visibility',
+                                    'vn_sim_bridge.render.warp_shading',
+                                    'vn_sim_bridge.render.warp_sensor',
                                     'vn_sim_bridge.navigation.warp_decisions'])
 def test_the_kernels_compile_for_a_gpu(tmp_path, module):
     code = (f'import importlib, warp as wp\nm = importlib.import_module({module!r})\n'

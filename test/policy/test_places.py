@@ -21,7 +21,7 @@ from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.places import HEADINGS, MultiViewAveraging
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.datasets.recorded_views import GraphViews
-from vn_sim_bridge.recorded.pose_lattice import MOST
+from vn_sim_bridge.recorded.lattice_motion import MOST_REGRET
 from vn_sim_bridge.recorded.relight import draw_light, relight
 from vn_sim_bridge.simulators.recorded import RecordedSimulator
 from vn_sim_bridge.teach_place import make_views, regrets
@@ -246,7 +246,7 @@ def test_regrets_are_what_actions_lose_on_the_shortest_ways(corridor):
     own = corridor.with_goals([0, 3])
     poses = corridor.poses[::7]
     found = regrets(own, poses)
-    assert found.shape == (2, len(poses), 4) and found.min() == 0 and found.max() <= MOST
+    assert found.shape == (2, len(poses), 4) and found.min() == 0 and found.max() <= MOST_REGRET
     for goal, row in zip(own.goals, found, strict=True):
         ends = np.tile(np.array(goal.pose), (len(poses), 1))
         best = corridor.map.actions(poses, ends)

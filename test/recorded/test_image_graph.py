@@ -17,7 +17,8 @@ from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.recorded.image_graph import KEPT, build_graph
-from vn_sim_bridge.recorded.pose_lattice import GAP, HEADING, TURNED_MOST, _components
+from vn_sim_bridge.recorded.lattice_graph import components
+from vn_sim_bridge.recorded.open_poses import GAP, HEADING, TURNED_MOST
 from vn_sim_bridge.simulators.house import HouseSimulator
 from vn_sim_bridge.simulators.recorded import RecordedSimulator, turned
 from vn_sim_bridge.teach_place import held_out, make_env, make_pairs
@@ -209,7 +210,7 @@ def test_components_are_those_of_a_search():
         reach = np.eye(count, dtype=bool)
         for _ in range(count):
             reach = reach | reach[to].any(axis=1)
-        number = _components(to)
+        number = components(to)
         assert np.array_equal(number[:, None] == number[None, :], reach & reach.T)
 
 
@@ -321,11 +322,16 @@ def test_depth_of_the_bag_measures_the_overlap():
     assert info['depth'].dtype == np.float32
     env.simulator.place(np.arange(2), env.goal_poses[info['goal']])
     env.simulator._draw = False
-    assert (env._overlap(env.simulator.observe().depth) > 0.95).all()
+
+    def shares(env):
+        return env._views.co_visibility(env._picture, env._shown_goal,
+                                        env.simulator.observe().depth)
+
+    assert (shares(env) > 0.95).all()
     away = env.goal_poses[info['goal']].copy()
     away[:, 2] = wrap_angle(away[:, 2] + math.pi)
     env.simulator.place(np.arange(2), away)
-    assert (env._overlap(env.simulator.observe().depth) < 0.1).all()
+    assert (shares(env) < 0.1).all()
 
 
 @pytest.mark.parametrize('options', [

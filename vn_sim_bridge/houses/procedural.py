@@ -15,7 +15,13 @@ from vn_sim_bridge.floor.floor_map import (
     main_component,
 )
 from vn_sim_bridge.houses.bake import light_baker
-from vn_sim_bridge.houses.furniture import KINDS, OPTIONAL_PROBABILITY, ROOM_PROGRAMMES, TALL
+from vn_sim_bridge.houses.furniture import (
+    DRAWINGS,
+    KINDS,
+    OPTIONAL_PROBABILITY,
+    ROOM_PROGRAMMES,
+    TALL,
+)
 from vn_sim_bridge.houses.house import House, Obstacle
 from vn_sim_bridge.houses.labels import LABEL
 from vn_sim_bridge.houses.layout import (
@@ -280,7 +286,7 @@ class _Construction:
         if not self._fits(index, box):
             return False
         piece = Piece(self.builder, self.look, origin, quarter, self._next_instance(), self.rng)
-        kind.draw(piece, width, depth, height)
+        DRAWINGS[name](piece, width, depth, height)
         self.builder.end_group()
         self.obstacles.append(Obstacle(box, name))
         return True

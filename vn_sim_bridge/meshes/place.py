@@ -44,7 +44,7 @@ class RoomOutline(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class MeshPlace:
-    """Has what a `House` has for tasks, contacts and maps (`floor.places.HousePlace`).
+    """Has what a `House` has for tasks, contacts and maps (`floor.places.RoomPlace`).
 
     A room that is no rectangle is several ones of one name in `rooms`.
     """

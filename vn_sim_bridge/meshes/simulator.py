@@ -40,7 +40,7 @@ Maker = Callable[[], tuple[MeshPlace, Scene]]
 class MeshSimulator(BaseSimulator):
     """N robots in meshes. A subclass writes `open`: it names its places and how each is read.
 
-    Every place is a `floor.places.HousePlace`. A robot's place stays in memory; others as far as
+    Every place is a `floor.places.RoomPlace`. A robot's place stays in memory; others as far as
     the budget goes.
 
     Args:

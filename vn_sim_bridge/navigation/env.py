@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -12,7 +11,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from vn_nav.co_visibility import GRID, co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.labels import label_dtype
 from vn_nav.reset_arguments import are_several, read_options, read_seed, read_seeds
@@ -31,16 +29,15 @@ from vn_sim_bridge.navigation.env_config import (
     with_own_actions,
 )
 from vn_sim_bridge.navigation.episodes import draw_grip, draw_motion_scale, draw_variant
-from vn_sim_bridge.navigation.explorer import Explorer
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
-from vn_sim_bridge.navigation.oracle import FloorOracle, turning_table
+from vn_sim_bridge.navigation.goal_views import GoalViews
 from vn_sim_bridge.navigation.own_objects import OwnObjectGoal
 from vn_sim_bridge.navigation.tasks import BLANK, RIGHT, WRONG
+from vn_sim_bridge.navigation.teachers import ExplorerTeacher, FloorTeacher
 from vn_sim_bridge.simulator import Frames, Motion, Simulator
 from vn_sim_bridge.simulators import open_simulator, robot_for
 
-SQUARE = 1.0  # m, side of the squares of floor that exploration counts
-BATCH = 256  # goal pictures drawn at a time: few need little memory
+SQUARE_SIDE = 1.0  # m, of the squares of floor that exploration counts
 
 
 class NavigationEnv(gymnasium.vector.VectorEnv):
@@ -107,8 +104,15 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
         self._deltas = np.array([[a.dx, a.dy, a.dyaw, a.dpitch] for a in self.robot.actions])
         self._sizes = np.array([abs(action.size) for action in self.robot.actions])
-        self._make_goals()
-        self.goal_features = self._make_goal_features()
+        self._views = GoalViews(
+            self.simulator, self.task.views, variants=config.pictures_per_goal, size=config.size,
+            seed=config.seed,
+            label_type=label_dtype(len(self.label_names)),
+            with_points=bool({'overlap', 'explorer_action'} & set(config.privileged)))
+        self.goals, self.goal_segmentation = self._views.pictures, self._views.segmentation
+        self.goal_poses, self.goal_rooms = self._views.poses, self._views.names
+        self.blank_goal = self._views.blank
+        self.goal_features = self._views.features
         self._make_spaces()
         self._tau = 1.0
         self._mode = RIGHT
@@ -130,14 +134,15 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             FloorDistances(self.places, n) if have_floors(self.places) else SeparateDistances(n))
         cells = (self._distances.maps.shape[1:] if isinstance(self._distances, FloorDistances)
                  else (0, 0))
-        rows, columns = (math.ceil(side * CELL / SQUARE) for side in cells)
+        rows, columns = (math.ceil(side * CELL / SQUARE_SIDE) for side in cells)
         self._visited = np.zeros((n, rows, columns), bool)
         # Options that are off add nothing to the state.
         used = {'_visited': config.exploration_reward,
                 '_picture': set(config.privileged) & {'goal_pose', 'overlap', 'explorer_action'}}
         self._state = (*self._STATE, *(name for name in used if used[name]))
-        self._explorer = self._make_explorer() if 'explorer_action' in config.privileged else None
-        self._oracle: FloorOracle | None = None  # made when it is asked for
+        self._explorer = (self._make_explorer_teacher() if 'explorer_action' in config.privileged
+                          else None)
+        self._floor_teacher: FloorTeacher | None = None  # made when it is asked for
 
     @property
     def place_index(self) -> np.ndarray:
@@ -149,15 +154,13 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """Behind the ids of segmentations; none where the simulator has no labels."""
         return self.simulator.label_names if self.simulator.capabilities.labels else ()
 
-    def _make_explorer(self) -> Explorer:
+    def _make_explorer_teacher(self) -> ExplorerTeacher:
         if self.config.task != 'image':
             raise UserError('the explorer looks for the place of a picture (task image)',
                             self.config.task, 'leave out explorer_action')
-        table = turning_table(self.action_names)
-        return Explorer(
-            list(map(walled, self.places)), self.num_envs, fov=self.robot.camera_fov,
-            turn=self._deltas[table['rotate_left'], 2], length=self._deltas[table['forward'], 0],
-            radius=tasks.ARRIVAL_RADIUS)
+        return ExplorerTeacher(list(map(walled, self.places)), self.num_envs,
+                               fov=self.robot.camera_fov, action_names=self.action_names,
+                               deltas=self._deltas)
 
     def _make_task(self) -> tasks.Task:
         config, distance = self.config, self.config.min_start_distance
@@ -178,45 +181,6 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                                   label_names=self.label_names,
                                   room_objects=self.simulator.room_objects)
         return tasks.Collect(self.places, config.num_envs, models=models, objects=config.objects)
-
-    def _make_goals(self) -> None:
-        """The pictures of all views, each in some lights of its own."""
-        views = self.task.views
-        self.goal_poses = np.array([view.pose for view in views]).reshape(-1, 4)
-        self.goal_rooms = (*(view.name for view in views), 'nothing')
-        self._variants = self.config.pictures_per_goal
-        size, count = self.config.size, len(views) * self._variants
-        self.goals = np.full((count + 1, 3, size, size), 128, np.uint8)
-        self.goal_segmentation = np.zeros((count + 1, size, size),
-                                          label_dtype(len(self.label_names)))
-        self.blank_goal = count
-        wanted = self.simulator.capabilities.depth and bool(
-            {'overlap', 'explorer_action'} & set(self.config.privileged))
-        self._goal_points = np.full((count + 1 if wanted else 0, GRID * GRID, 3), np.nan,
-                                    np.float32)
-        for first in range(0, count, BATCH):
-            part = slice(first, min(first + BATCH, count))
-            view, variant = np.divmod(np.arange(part.start, part.stop), self._variants)
-            poses = self.goal_poses[view]
-            appearance = self.simulator.appearance(self.config.seed, Stream.GOAL_APPEARANCE, view,
-                                                   variant)
-            frames = self.simulator.view(
-                np.array([views[k].place for k in view]), poses, None, appearance,
-                key(self.config.seed, Stream.GOAL_APPEARANCE, view, variant, 99),
-                [views[k].objects for k in view])
-            self.goals[part], self.goal_segmentation[part] = frames.rgb, frames.labels
-            if wanted:
-                self._goal_points[part] = lift(frames.depth,
-                                               *self.simulator.cameras(poses, appearance))
-
-    def _make_goal_features(self) -> np.ndarray | None:
-        """Frozen features [G,F] of the goals, if the simulator knows any; of a blank one zeros."""
-        if not self.simulator.feature_size:
-            return None
-        rows = self.simulator.features(np.array([view.place for view in self.task.views]),
-                                       self.goal_poses)
-        return np.concatenate([np.repeat(rows, self._variants, axis=0),
-                               np.zeros((1, rows.shape[1]), np.float32)])
 
     def _make_spaces(self) -> None:
         size, actions = self.config.size, len(self.action_names)
@@ -295,8 +259,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if isinstance(self._distances, FloorDistances):
             more['maps'] = self._distances.maps.copy()
         if self._explorer is not None:
-            more |= {'explorer_seen': self._explorer.seen.copy(),
-                     'explorer_found': self._explorer.found.copy()}
+            more |= {'explorer_seen': self._explorer.explorer.seen.copy(),
+                     'explorer_found': self._explorer.explorer.found.copy()}
         # One seed for all, as a training has it, is kept as one number.
         alike = (self._seeds == self._seeds[0]).all() and (
             self._numbers == np.arange(self.num_envs)).all()
@@ -324,8 +288,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             for n in range(self.num_envs):
                 self._distances.set(n, self.task.goal_field(int(self._goal[n])).field)
         if self._explorer is not None:
-            self._explorer.seen[:] = state['explorer_seen']
-            self._explorer.found[:] = state['explorer_found']
+            self._explorer.explorer.seen[:] = state['explorer_seen']
+            self._explorer.explorer.found[:] = state['explorer_found']
         for name, part in self.simulator.objects._asdict().items():
             part[:] = state[f'objects_{name}']
         for name, part in self.task.state.items():
@@ -467,12 +431,12 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             counter = (int(self._seeds[n]), int(self._numbers[n]), int(self._episode[n]))
             episode = self.task.begin(int(n), int(self.place_index[n]), counter, self._tau,
                                       self._mode)
-            variant = draw_variant(self._variants, *counter)
+            variant = draw_variant(self._views.variants, *counter)
             self._goal[n], self._goal_yaw[n] = episode.goal, episode.goal_yaw
             self._shown_goal[n] = (self.blank_goal if episode.shown < 0
-                                   else episode.shown * self._variants + variant)
+                                   else episode.shown * self._views.variants + variant)
             true = episode.shown if self._mode == RIGHT else episode.goal
-            self._picture[n] = true * self._variants + variant
+            self._picture[n] = true * self._views.variants + variant
             if teleport:
                 self.simulator.place(np.array([n]), episode.start[None])
             self.simulator.set_objects(n, episode.objects)
@@ -498,7 +462,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """Which robots stand on a square of floor that is new to their episodes, [K] bool."""
         assert isinstance(self._distances, FloorDistances)  # see `check_simulator`
         corner = self._distances.origins[self.place_index[env_ids]]
-        at = (self.simulator.poses[env_ids, :2] - corner) / SQUARE
+        at = (self.simulator.poses[env_ids, :2] - corner) / SQUARE_SIDE
         column, row = at.astype(np.int64).T
         new = ~self._visited[env_ids, row, column]
         self._visited[env_ids, row, column] = True
@@ -567,42 +531,16 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             info['oracle_regret'] = self.simulator.planner.regrets(self.simulator.poses,
                                                                    self.goal_poses[self._goal])
         if 'goal_pose' in self.config.privileged:
-            info['goal_pose'] = self._goal_pose()
+            info['goal_pose'] = self._views.relative_poses(self._picture)
         if {'overlap', 'explorer_action'} & set(self.config.privileged):
-            info['overlap'] = self._overlap(frames.depth)
+            info['overlap'] = self._views.co_visibility(self._picture, self._shown_goal,
+                                                        frames.depth)
         if self._explorer is not None:
-            info['explorer_action'] = self._explore_action(reset, info['overlap'])
+            assert isinstance(self._distances, FloorDistances)  # where there are walls is a floor
+            info['explorer_action'] = self._explorer.actions(
+                reset, self.simulator.poses, self.place_index, info['overlap'], self._distance,
+                self._goal_yaw, self._distances.maps, self._last_action)
         return observation, info
-
-    def _explore_action(self, reset: np.ndarray, overlap: np.ndarray) -> np.ndarray:
-        """What the `Explorer` would do, [N] int64; it looks from here."""
-        assert self._explorer is not None  # the caller has one
-        assert isinstance(self._distances, FloorDistances)  # where there are walls is a floor
-        self._explorer.begin(np.nonzero(reset)[0])
-        turned = np.where(self._last_action < 0, 0, np.sign(self._deltas[self._last_action, 2]))
-        turns = self._explorer.turns(self.simulator.poses, self.place_index, overlap,
-                                     self._distance, self._goal_yaw, self._distances.maps,
-                                     turned)
-        table = turning_table(self.action_names)
-        return np.where(turns == 0, table['forward'], np.where(
-            turns > 0, table['rotate_left'], table['rotate_right']))
-
-    def _goal_pose(self) -> np.ndarray:
-        if not self.task.views:
-            return np.zeros((self.num_envs, 4), np.float32)
-        # As the picture shows it, which was taken a little beside the robot in some simulators.
-        return relative_pose(self.simulator.seen_from,
-                             self.goal_poses[self._picture // self._variants])
-
-    def _overlap(self, depth: np.ndarray) -> np.ndarray:
-        if not self.task.views:
-            return np.zeros(self.num_envs, np.float32)
-        if not self.simulator.capabilities.depth:
-            shown = self.simulator.co_visibility(self.goal_poses[self._picture // self._variants])
-            return np.where(self._shown_goal == self.blank_goal, np.float32(0), shown)
-        # The grey picture has no points.
-        picture = np.where(self._shown_goal == self.blank_goal, self.blank_goal, self._picture)
-        return co_visible(self._goal_points[picture], depth, *self.simulator.cameras())
 
     def oracle_actions(self) -> np.ndarray:
         """The next action [N] on a shortest path to the goal, from the simulator's geometry.
@@ -616,24 +554,19 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if not (self.simulator.capabilities.geodesic or self.simulator.planner):
             raise UserError('the shortest-path action needs a simulator that knows ways',
                             self.simulator_name, 'use another control')
-        there = tasks.arrived(self._distance, self._heading_error())
+        arrived = tasks.arrived(self._distance, self._heading_error())
         if self.simulator.planner is not None:
             actions = self.simulator.planner.actions(self.simulator.poses,
                                                      self.goal_poses[self._goal])
         else:
-            actions = self._floor_actions()
+            near = (self._distance <= tasks.ARRIVAL_RADIUS) & (self.config.task == 'image')
+            if self._floor_teacher is None:
+                self._floor_teacher = FloorTeacher(self.action_names, self._deltas)
+            actions = self._floor_teacher.actions(
+                self.simulator.poses, self._goal_yaw, near, self.simulator.reach,
+                self._distance_from)
         return actions if self.declare_action is None else np.where(
-            there, self.declare_action, actions)
-
-    def _floor_actions(self) -> np.ndarray:
-        if self._oracle is None:
-            self._oracle = FloorOracle(self.action_names, self._deltas)
-        near = (self._distance <= tasks.ARRIVAL_RADIUS) & (self.config.task == 'image')
-        return np.array([self._oracle.action(
-            self.simulator.poses[n], self._goal_yaw[n] if near[n] else None,
-            functools.partial(self.simulator.reach, n),
-            functools.partial(self._distance_from, n))
-            for n in range(self.num_envs)], np.int64)
+            arrived, self.declare_action, actions)
 
 
 def _paid(motion: Motion | None, driving: np.ndarray, verdict: tasks.Judgement

@@ -12,7 +12,7 @@ from vn_sim_bridge.navigation.warp_episodes import begin_episode
 from vn_sim_bridge.navigation.warp_motion import distance_at, travel, wrap
 from vn_sim_bridge.navigation.warp_random import bits, normal, uniform
 from vn_sim_bridge.navigation.warp_state import Houses, Robots, Rules
-from vn_sim_bridge.render.warp_renderer import camera_frame
+from vn_sim_bridge.render.warp_visibility import camera_frame
 
 wp.set_module_options({'enable_backward': False, 'fast_math': False})
 

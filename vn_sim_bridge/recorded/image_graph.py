@@ -23,7 +23,8 @@ from vn_nav.observation import preprocess
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import CELL, FloorMap
-from vn_sim_bridge.recorded.pose_lattice import PoseMap, in_sight
+from vn_sim_bridge.recorded.open_poses import in_sight
+from vn_sim_bridge.recorded.pose_lattice import PoseMap
 from vn_sim_bridge.simulator import Goal
 
 MARGIN = 0.3  # m beside the driven path

@@ -192,6 +192,7 @@ class GymSimulator(BaseSimulator):
         size, names = setup.size, setup.robot.action_names
         self._rgb = np.zeros((setup.num_envs, 3, size, size), np.uint8)
         self._numbers = np.zeros((len(scenes), len(names)), np.int64)  # of the robot's actions
+        self._cut_off = np.zeros(setup.num_envs, bool)  # since `broken_off` was last asked
         try:
             for n in range(setup.num_envs):
                 self._envs.append(OneEnvironment(scenes[n % len(scenes)]))
@@ -252,8 +253,13 @@ class GymSimulator(BaseSimulator):
                 raise UserError('rewards are finite', f'{reward[k]} of {self._envs[n].name}',
                                 'correct the environment')
             self._look(n)
-        return Motion(np.zeros((count, 4)), np.zeros(count, bool), reward, ended,
-                      truncated & ~ended)
+        self._cut_off[env_ids] |= truncated & ~ended
+        return Motion(np.zeros((count, 4)), np.zeros(count, bool), reward, ended)
+
+    def broken_off(self) -> np.ndarray:
+        """See `Simulator`: an environment's own limit of steps."""
+        cut_off, self._cut_off = self._cut_off, np.zeros(self.num_envs, bool)
+        return cut_off
 
     def observe(self, env_ids: np.ndarray | None = None, keys: np.ndarray | None = None) -> Frames:
         """The pictures of the environments."""

@@ -17,15 +17,8 @@ from vn_nav.scenes import SceneName, options_of
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.floor.floor_map import CELL
 from vn_sim_bridge.recorded.image_graph import ImageGraph
-from vn_sim_bridge.recorded.pose_lattice import (
-    FARTHEST,
-    GAP,
-    HEADING,
-    NEAR,
-    TURNED,
-    TURNED_MOST,
-    in_sight,
-)
+from vn_sim_bridge.recorded.open_poses import FARTHEST, GAP, HEADING, TURNED_MOST, in_sight
+from vn_sim_bridge.recorded.pose_lattice import NEAR, TURNED
 from vn_sim_bridge.recorded.relight import draw_light, relight
 from vn_sim_bridge.simulator import (
     BaseSimulator,
