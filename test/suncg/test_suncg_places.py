@@ -90,15 +90,17 @@ def test_levels_are_chosen_by_number(tmp_path):
     upper, texts = room(9, -8, -4, 'Bedroom', y=3.0)
     upper['id'] = '1_0'
     write_house(tmp_path, levels=[
-        {'id': '0', 'nodes': [ground]}, {'id': '1', 'nodes': [upper]}])
+        {'id': '0', 'nodes': [ground]}, {'id': '1', 'nodes': [upper]}, {'id': '2', 'bbox': {}}])
     for letter, text in texts.items():
         (tmp_path / 'room' / 'h' / f'fr_0rm_9{letter}.obj').write_text(text)
     below, above = place_of(tmp_path), place_of(tmp_path, level=1)
     assert (below.level, above.level) == (0.0, 3.0)
     assert [r.kind for r in below.rooms] == ['kitchen']
     assert {r.kind for r in above.rooms} == {'bedroom'} and above.area > 8
-    with pytest.raises(UserError, match='0 to 1'):
-        place_of(tmp_path, level=2)
+    with pytest.raises(UserError, match='level 2'):
+        place_of(tmp_path, level=2)  # with nothing in it
+    with pytest.raises(UserError, match='0 to 2'):
+        place_of(tmp_path, level=3)
 
 
 def test_room_types_are_house3d_s(tmp_path):

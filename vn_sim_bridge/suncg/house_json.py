@@ -100,9 +100,12 @@ def read_house(path: Path) -> HouseFile:
 
 
 def _level(number: int, data: dict[str, Any]) -> Level:
-    nodes = tuple(_node(node) for node in data['nodes'] if node.get('valid', 1))
+    # Some houses have levels without anything in them.
+    nodes = tuple(_node(node) for node in data.get('nodes', ()) if node.get('valid', 1))
     if 'bbox' in data and data['bbox'].get('min'):
         low, high = _box(data['bbox'])
+    elif not nodes:
+        low = high = np.zeros(3)
     else:
         low, high = (np.array([getattr(node, end) for node in nodes]) for end in ('low', 'high'))
         low, high = low.min(axis=0), high.max(axis=0)
