@@ -34,6 +34,7 @@ class Conformance(abc.ABC):
     contact_slack = 0.02  # m that a robot may still creep towards what it touches
     depth_slack = 0.9  # share of a picture's points that the same pose sees again
 
+    growth_robots = 4  # that drive 10,000 steps
     state_slack = 0.0  # of figures, where an engine has its own numbers for a pose
 
     @abc.abstractmethod
@@ -302,11 +303,12 @@ class Conformance(abc.ABC):
     @pytest.mark.slow
     @pytest.mark.timeout(600)
     def test_ten_thousand_steps_do_not_grow(self):
-        env = self.env(4, max_decisions=50)
+        robots = self.growth_robots
+        env = self.env(robots, max_decisions=50)
         env.reset(seed=0)
         rng = np.random.default_rng(0)
         for step in range(10_000):
-            env.step(rng.integers(0, len(self.actions), 4))
+            env.step(rng.integers(0, len(self.actions), robots))
             if step == 2_000:
                 begun = resident_mb()
         assert resident_mb() - begun < GROWTH_MB
