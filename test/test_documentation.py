@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / 'docs'
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
-         *sorted(DOCS.glob('*.md'))]
+         *sorted(DOCS.glob('*.md')), *sorted(DOCS.glob('simulators/*.md'))]
 CARDS = sorted(ROOT.glob('models/*/README.md'))  # written by a command
 WIDTH = 100
 # A file that a page names in `code`, and those that are on their way.
@@ -48,11 +48,15 @@ def navigation():
                        re.MULTILINE | re.DOTALL)
     lines = [line for tree in trees for line in tree.splitlines()
              if line and not line.startswith(':')]
-    return [re.sub(r'.*<(.+)>', r'\1', line) for line in lines]
+    names = [re.sub(r'.*<(.+)>', r'\1', line) for line in lines]
+    return [found for name in names for found in (
+        sorted(str(path.relative_to(DOCS).with_suffix('')) for path in DOCS.glob(f'{name}.md'))
+        if '*' in name else [name])]
 
 
 def test_every_page_is_in_the_navigation():
-    written = {path.stem for path in DOCS.glob('*.md')} - {'index'}
+    written = {path.stem for path in DOCS.glob('*.md')} - {'index'} | {
+        f'simulators/{path.stem}' for path in DOCS.glob('simulators/*.md')}
     made = {f'generated/{name}' for name in (*generate.pages(), *generate.PACKAGES)}
     listed = navigation()
     assert set(listed) == written | made
