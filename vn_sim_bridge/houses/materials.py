@@ -75,7 +75,7 @@ def _fabric(rng) -> np.ndarray:
 def _wood(rng) -> np.ndarray:
     y, x = np.mgrid[:SIDE, :SIDE]
     return grey(0.84 + 0.12 * np.sin(x * 2 * np.pi / 16 + 5 * noise(rng, 4))
-                 * (0.5 + 0.5 * noise(rng, 8)))
+                * (0.5 + 0.5 * noise(rng, 8)))
 
 
 def _marble(rng) -> np.ndarray:

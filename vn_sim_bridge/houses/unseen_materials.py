@@ -17,7 +17,7 @@ def _herringbone(rng) -> np.ndarray:
 
 def _cork(rng) -> np.ndarray:
     return grey(np.where(rng.random((SIDE, SIDE)) < 0.16, 0.62, 0.95)
-                 * (0.88 + 0.12 * noise(rng, 16)))
+                * (0.88 + 0.12 * noise(rng, 16)))
 
 
 def _diamonds(rng) -> np.ndarray:
@@ -54,7 +54,7 @@ def _concrete(rng) -> np.ndarray:
 def _damask(rng) -> np.ndarray:
     y, x = np.mgrid[:SIDE, :SIDE] * (2 * np.pi / 32)
     return grey(np.where(np.sin(x) * np.cos(y) + 0.6 * np.cos(2 * x + np.sin(y)) > 0.15, 0.74,
-                          1.0))
+                         1.0))
 
 
 def _bands(rng) -> np.ndarray:

@@ -102,7 +102,7 @@ class PoseMap:
             [N,3] where they are then, and [N] the share of each move that was done.
         """
         return drive(np.ascontiguousarray(poses[:, :3], float),
-                      np.ascontiguousarray(deltas[:, :3], float), *self.lattice)
+                     np.ascontiguousarray(deltas[:, :3], float), *self.lattice)
 
     @functools.cached_property
     def leads(self) -> tuple[np.ndarray, np.ndarray]:
@@ -165,7 +165,7 @@ class PoseMap:
             poses: [N,>=3].
         """
         return regrets_of(np.ascontiguousarray(poses[:, :3], float), self.moves,
-                        self.costs(*map(float, goal_pose[:3])), self.inner, *self.lattice)
+                          self.costs(*map(float, goal_pose[:3])), self.inner, *self.lattice)
 
     def regrets(self, poses: np.ndarray, goal_poses: np.ndarray) -> np.ndarray:
         """As `regrets_to`, of poses [N,4] each towards a goal of its own, [N,4]."""
@@ -177,5 +177,5 @@ class PoseMap:
         chosen = np.empty(len(poses), np.int64)
         for n, goal in enumerate(goal_poses):
             chosen[n] = choose(poses[n, :3], self.moves, self.costs(*map(float, goal[:3])),
-                                self.inner, *self.lattice)
+                               self.inner, *self.lattice)
         return chosen

@@ -101,6 +101,7 @@ class Rasterizer:
         numba.set_num_threads(before)
         return out
 
+
 # Numba compiles the functions that a function calls into it, but its cache on disk notices changes
 # only in the file of the function itself. So the functions below hold a digest of the other files:
 # what a function holds is part of the cache's key.

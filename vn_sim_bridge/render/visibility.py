@@ -127,7 +127,7 @@ def update_tiles(inverse_depth, tiles):
 
 @exact
 def draw_faces(pack, first_face, last_face, first_ident, frame, focal, size, polygon, clipped,
-                spans, inverse_depth, ident_of_pixel):
+               spans, inverse_depth, ident_of_pixel):
     """Scan-convert consecutive polygons into the visibility buffer."""
     px, py, pz = frame[0], frame[1], frame[2]
     fx, fy, fz = frame[3], frame[4], frame[5]

@@ -54,7 +54,7 @@ def camera_frame(cameras: wp.array2d(dtype=wp.float64), n: int):
     cy, sy = wp.cos(cameras[n, 3]), wp.sin(cameras[n, 3])
     cp, sp = wp.cos(cameras[n, 4]), wp.sin(cameras[n, 4])
     return Frame(cameras[n, 0], cameras[n, 1], cameras[n, 2], cp * cy, cp * sy, -sp, sy, -cy,
-                       wp.float64(0.0), -sp * cy, -sp * sy, -cp)
+                 wp.float64(0.0), -sp * cy, -sp * sy, -cp)
 
 
 @wp.func
