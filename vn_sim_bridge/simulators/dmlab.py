@@ -121,9 +121,9 @@ class LabSimulator(BaseSimulator):
             if place is None:
                 engine = index % n
                 self._switch(engine, index)
-                spawns = [self.engines.ask({engine: {'do': 'reset', 'seed': seed}})[engine]['pose']
-                          for seed in range(SPAWNS)]
-                spawns = np.unique(np.round(np.array(spawns), 2), axis=0)
+                found = [self.engines.ask({engine: {'do': 'reset', 'seed': seed}})[engine]['pose']
+                         for seed in range(SPAWNS)]
+                spawns = np.unique(np.round(np.array(found), 2), axis=0)
                 floors.append(float(spawns[:, 2].min()) - STANDING)
                 places.append(LevelPlace(name, np.column_stack([
                     spawns[:, :2] / UNITS, wrapped(np.radians(spawns[:, 3]))])))
