@@ -55,7 +55,7 @@ def test_debian_packages_that_are_missing_are_named_in_one_line(nothing, tmp_pat
     monkeypatch.setattr(install, 'LIBRARIES', {'libno_such_thing.so.9': 'libno-such-thing9'})
     with pytest.raises(UserError, match='apt install libno-such-thing9'):
         install.interpreter()
-    assert simulators.missing(simulators.TABLE['dmlab']) == ['without libno-such-thing9']
+    assert simulators.missing(simulators.TABLE['dmlab']) == ['libno-such-thing9']
 
 
 def test_only_what_can_be_installed_is_installed(capsys):

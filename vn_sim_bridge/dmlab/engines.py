@@ -92,8 +92,9 @@ class Engine:
         self.process.kill()
         self.process.wait()
         for pipe in (self.process.stdin, self.process.stdout):
-            with contextlib.suppress(OSError):
-                pipe.close()
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
 
 
 class Engines:
@@ -171,12 +172,12 @@ class Engines:
                     for each in waiting:
                         self._discard(each)
                     raise _unable(str(error)) from error
-            for n, error in lost.items():
+            for n, loss in lost.items():
                 self._discard(n)
                 self.broken[n] = True
                 failed[n] += 1
                 if failed[n] >= TRIES:
-                    raise _unable(str(error)) from error
+                    raise _unable(str(loss)) from loss
             waiting = list(lost)
 
     def _begin(self, n: int, lost: dict[int, Lost]) -> int:

@@ -42,14 +42,13 @@ def interpreter() -> Path:
             raise UserError(f'{PYTHON} is a Python that has deepmind_lab', given,
                             'correct it, or leave it out')
         return Path(given).absolute()
-    python = folder() / 'bin' / 'python'
-    if not (folder() / 'installed').exists() or not python.exists():
+    if not _is_made():
         raise UserError('the simulator dmlab has its engine in an environment of its own',
                         f'none in {folder()}', REMEDY)
     if lacking := missing_packages():
         raise UserError('the engine of DeepMind Lab needs Debian packages',
                         f'without {", ".join(lacking)}', f'apt install {" ".join(lacking)}')
-    return python
+    return folder() / 'bin' / 'python'
 
 
 def missing_packages() -> list[str]:
@@ -64,12 +63,15 @@ def missing_packages() -> list[str]:
 
 
 def missing() -> list[str]:
-    """What is missing here, in words."""
-    try:
-        interpreter()
-    except UserError as error:
-        return [str(error.received)]
-    return []
+    """What is missing here, in words; a Python that was named is looked at when it is used."""
+    if os.environ.get(PYTHON):
+        return []
+    engine = [] if _is_made() else [f'its engine (none in {folder()})']
+    return engine + missing_packages()
+
+
+def _is_made() -> bool:
+    return (folder() / 'installed').exists() and (folder() / 'bin' / 'python').exists()
 
 
 def install(system: bool) -> str:

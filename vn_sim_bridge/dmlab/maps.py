@@ -154,12 +154,13 @@ class TextPlace:
         while len(chosen) < min(self.level.goals, len(at)):
             chosen.append(int(gap.argmax()))
             gap = np.minimum(gap, np.hypot(*(at - at[chosen[-1]]).T))
-        found = []
+        found: list[Goal] = []
         for k in chosen:
             i, j = cells[k]
             free = [self._free(i, j, di, dj) for di, dj in ((0, 1), (-1, 0), (0, -1), (1, 0))]
             quarter = int(np.argmin([abs(way - VIEW) for way in free]))
-            found.append(Goal((*at[k].tolist(), wrapped(quarter * math.pi / 2), 0.0),
+            x, y = at[k].tolist()
+            found.append(Goal((x, y, wrapped(quarter * math.pi / 2), 0.0),
                               f'{self.level.rows[i][j]}{len(found) + 1}'))
         return tuple(found)
 
@@ -197,8 +198,8 @@ class LevelPlace:
 
     def __init__(self, name: str, spawns: np.ndarray):
         self.name, self.spawns = name, spawns
-        self.goals = tuple(Goal((*map(float, pose), 0.0), f'start {k + 1}')
-                           for k, pose in enumerate(spawns))
+        self.goals = tuple(Goal((x, y, yaw, 0.0), f'start {k + 1}')
+                           for k, (x, y, yaw) in enumerate(spawns.tolist()))
 
     def starts(self) -> tuple[np.ndarray, np.ndarray]:
         """Where episodes may begin, see `Place`."""

@@ -19,6 +19,7 @@ import mmap
 import os
 import signal
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def load_engine():
     """The module of the engine: a genuine `deepmind_lab`, or that of dmhouse."""
     for name in ('deepmind_lab', 'dmhouse'):
         spec = importlib.util.find_spec(name)
-        if spec is None:
+        if spec is None or spec.origin is None:
             continue
         folder = os.path.dirname(spec.origin)
         library = os.path.join(folder, 'deepmind_lab.so')
@@ -41,7 +42,9 @@ def load_engine():
             return importlib.import_module(name), folder
         # The package's own __init__ asks for a Gym of long ago.
         loader = importlib.machinery.ExtensionFileLoader(name, library)
-        module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))
+        own = importlib.util.spec_from_loader(name, loader)
+        assert own is not None  # there is a loader
+        module = importlib.util.module_from_spec(own)
         sys.modules[name] = module
         loader.exec_module(module)
         module.set_runfiles_path(folder)
@@ -88,7 +91,8 @@ class Worker:
     """One engine and the memory that it draws into."""
 
     def __init__(self, memory):
-        self.memory, self.lab, self.push, self.native = memory, None, None, False
+        self.memory, self.push, self.native = memory, None, False
+        self.lab: Any = None  # of the engine's module
 
     def open(self, level, folder, cache, settings, width):
         """Start the engine with a level; in place of the one that it plays."""

@@ -22,6 +22,7 @@ from vn_sim_bridge.dmlab.engines import FOLDER, Engines
 from vn_sim_bridge.dmlab.install import MAPS, cache_folder, interpreter
 from vn_sim_bridge.dmlab.maps import UNITS, LevelPlace, TextPlace, wrapped
 from vn_sim_bridge.floor.contacts import World
+from vn_sim_bridge.floor.places import walled
 from vn_sim_bridge.simulator import BaseSimulator, Capabilities, Frames, Motion, Setup
 
 FLOOR = 1.0  # units: of a text map's floor
@@ -91,7 +92,8 @@ class LabSimulator(BaseSimulator):
             **vars(TEXT if ours else NATIVE), 'rewards': self._pays, 'teleport': not self._pays})
         self.world: World | None = None
         if ours:
-            self.world = World(self.places, self.place_index, setup.robot.footprint_radius)
+            self.world = World([walled(place) for place in self.places], self.place_index,
+                               setup.robot.footprint_radius)
             # One array each, in the world and here: a move changes both.
             self.poses, self.place_index = self.world.poses, self.world.place_index
         self.engines.broken[:] = False  # no episode has begun
@@ -121,9 +123,9 @@ class LabSimulator(BaseSimulator):
             if place is None:
                 engine = index % n
                 self._switch(engine, index)
-                spawns = [self.engines.ask({engine: {'do': 'reset', 'seed': seed}})[engine]['pose']
-                          for seed in range(SPAWNS)]
-                spawns = np.unique(np.round(np.array(spawns), 2), axis=0)
+                found = [self.engines.ask({engine: {'do': 'reset', 'seed': seed}})[engine]['pose']
+                         for seed in range(SPAWNS)]
+                spawns = np.unique(np.round(np.array(found), 2), axis=0)
                 floors.append(float(spawns[:, 2].min()) - STANDING)
                 places.append(LevelPlace(name, np.column_stack([
                     spawns[:, :2] / UNITS, wrapped(np.radians(spawns[:, 3]))])))
