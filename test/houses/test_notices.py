@@ -7,6 +7,7 @@ from gltf_files import SQUARE, Gltf
 
 from vn_sim_bridge import notices
 from vn_sim_bridge.houses.mesh import load_mesh, read_parts
+from vn_sim_bridge.meshes import vocabulary as vocabulary_module
 from vn_sim_bridge.meshes.vocabulary import Vocabulary
 from vn_sim_bridge.render.mesh_scene import Surface, mesh_scene
 
@@ -77,7 +78,8 @@ def test_textures_beyond_the_budget_are_halved_and_it_is_said(capsys):
     assert 'a flat: textures are drawn with at most 128 pixels' in capsys.readouterr().err
 
 
-def test_more_classes_than_a_pixel_can_name_is_said(capsys):
+def test_more_classes_than_a_pixel_can_name_is_said(capsys, monkeypatch):
+    monkeypatch.setattr(vocabulary_module, 'MOST_LABELS', 256)
     vocabulary = Vocabulary({f'class {k}': 300 - k for k in range(300)}, 'the scenes')
     assert len(vocabulary.names) == 256
     assert 'has 300 classes' in capsys.readouterr().err
