@@ -8,6 +8,7 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
 import generate  # noqa: E402 - beside this file
 from markdown_docstrings import to_rst  # noqa: E402
+from sphinx.ext.autodoc.mock import mock  # noqa: E402
 
 project = 'vn_nav'
 author = 'vn_nav maintainers'
@@ -48,6 +49,10 @@ html_show_sphinx = False
 def setup(app):
     """Make the generated pages, and have docstrings and links fit the site."""
     generate.write_all()
+    # For the whole build: the pages of sources import modules as well, without the mock, and
+    # kernels of a real Warp do not take what a mocked one has made.
+    app.mocked = mock(autodoc_mock_imports)
+    app.mocked.__enter__()
     app.connect('autodoc-process-docstring', lambda *event: to_rst(event[-1]), priority=400)
     app.connect('source-read', _own_links)
 

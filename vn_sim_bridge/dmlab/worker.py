@@ -4,11 +4,13 @@ It runs in the engine's virtual environment: NumPy and the engine, nothing of th
 Arguments: the number of an open file that holds pictures [rows, size, size, 4] uint8 (RGB, depth),
 and the size.
 
-Requests are lines {"do": NAME, ...} on standard input, answers lines on standard output:
+Requests are lines {"do": NAME, ...} on standard input, answers lines on standard output::
+
     open    level, folder (of levels), cache (folder of compiled maps), settings, width
     reset   seed: the pose [x, y, z, yaw] where the level puts the player
     go      poses [[x, y, z, yaw], ...], rows (of the file), act (a decision): reward, ended
     free    ways [[x, y, z, heading, length], ...]: how far each is free
+
 Lengths are units of the engine, angles degrees. An error is {"error": TEXT}.
 """
 
