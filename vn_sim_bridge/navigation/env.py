@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import gymnasium
 import numpy as np
@@ -13,31 +12,29 @@ from gymnasium.vector.utils import batch_space
 
 from vn_nav.errors import UserError
 from vn_nav.labels import label_dtype
-from vn_nav.reset_arguments import are_several, read_options, read_seed, read_seeds
+from vn_nav.reset_arguments import read_options
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import parse_scene
-from vn_sim_bridge.counter_random import Stream, key, normal, uniform
-from vn_sim_bridge.floor.contacts import motion_noise
-from vn_sim_bridge.floor.floor_map import CELL
-from vn_sim_bridge.floor.places import have_floors, walled, with_rooms
+from vn_sim_bridge.counter_random import Stream, key, uniform
+from vn_sim_bridge.floor.places import have_floors, walled
 from vn_sim_bridge.navigation import tasks
+from vn_sim_bridge.navigation.base_motion import BaseMotion, Counters
 from vn_sim_bridge.navigation.env_config import (
     EnvConfig,
     check_simulator,
-    objects_of,
     setup_for,
     with_own_actions,
 )
-from vn_sim_bridge.navigation.episodes import draw_grip, draw_motion_scale, draw_variant
+from vn_sim_bridge.navigation.episodes import draw_motion_scale, draw_variant
+from vn_sim_bridge.navigation.exploration import Exploration
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
 from vn_sim_bridge.navigation.goal_views import GoalViews
-from vn_sim_bridge.navigation.own_objects import OwnObjectGoal
+from vn_sim_bridge.navigation.make_task import make_task
+from vn_sim_bridge.navigation.seeds import Seeds, read_reset_mask
 from vn_sim_bridge.navigation.tasks import BLANK, RIGHT, WRONG
 from vn_sim_bridge.navigation.teachers import ExplorerTeacher, FloorTeacher
 from vn_sim_bridge.simulator import Frames, Motion, Simulator
 from vn_sim_bridge.simulators import open_simulator, robot_for
-
-SQUARE_SIDE = 1.0  # m, of the squares of floor that exploration counts
 
 
 class NavigationEnv(gymnasium.vector.VectorEnv):
@@ -96,14 +93,13 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.places = list(self.simulator.places)
         self._wanders = len(self.places) > n and not config.one_goal_per_env
         # Random numbers are functions of an environment's seed and number.
-        self._seeds, self._numbers = np.full(n, config.seed, np.int64), np.arange(n)
-        self.task = self._make_task()
+        self._seeds = Seeds(config.seed, n)
+        self.task = make_task(config, self.simulator, self.label_names)
         self.world_version = self.simulator.version
         self.simulator_name = parse_scene(self.places[0].name).simulator
         self.action_names = self.robot.action_names
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
-        self._deltas = np.array([[a.dx, a.dy, a.dyaw, a.dpitch] for a in self.robot.actions])
-        self._sizes = np.array([abs(action.size) for action in self.robot.actions])
+        self._base = BaseMotion(config, self.robot)
         self._views = GoalViews(
             self.simulator, self.task.views, variants=config.pictures_per_goal, size=config.size,
             seed=config.seed,
@@ -132,14 +128,13 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._last_image = np.zeros((n, 3, config.size, config.size), np.uint8)
         self._distances: FloorDistances | SeparateDistances = (
             FloorDistances(self.places, n) if have_floors(self.places) else SeparateDistances(n))
-        cells = (self._distances.maps.shape[1:] if isinstance(self._distances, FloorDistances)
-                 else (0, 0))
-        rows, columns = (math.ceil(side * CELL / SQUARE_SIDE) for side in cells)
-        self._visited = np.zeros((n, rows, columns), bool)
+        self._exploration: Exploration | None = None
+        if config.exploration_reward:
+            assert isinstance(self._distances, FloorDistances)  # see `check_simulator`
+            self._exploration = Exploration(self._distances, n)
         # Options that are off add nothing to the state.
-        used = {'_visited': config.exploration_reward,
-                '_picture': set(config.privileged) & {'goal_pose', 'overlap', 'explorer_action'}}
-        self._state = (*self._STATE, *(name for name in used if used[name]))
+        self._state = (*self._STATE, *(('_picture',) if set(config.privileged) & {
+            'goal_pose', 'overlap', 'explorer_action'} else ()))
         self._explorer = (self._make_explorer_teacher() if 'explorer_action' in config.privileged
                           else None)
         self._floor_teacher: FloorTeacher | None = None  # made when it is asked for
@@ -160,27 +155,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                             self.config.task, 'leave out explorer_action')
         return ExplorerTeacher(list(map(walled, self.places)), self.num_envs,
                                fov=self.robot.camera_fov, action_names=self.action_names,
-                               deltas=self._deltas)
-
-    def _make_task(self) -> tasks.Task:
-        config, distance = self.config, self.config.min_start_distance
-        if config.task == 'image':
-            return tasks.ImageGoal(self.places, config.num_envs, min_distance=distance,
-                                   fixed_goals=config.one_goal_per_env)
-        if config.task == 'object' and self.simulator.capabilities.own_objects:
-            return OwnObjectGoal(self.places, self.simulator.scatter, min_distance=distance)
-        models = objects_of(self.simulator, config.task)
-        if config.task == 'object':
-            return tasks.ObjectGoal(
-                self.places, config.num_envs, models=models, objects=config.objects,
-                pictures=max(4, config.pictures_per_goal), min_distance=distance,
-                seed=config.seed)
-        if config.task == 'room':
-            return tasks.RoomGoal(list(map(with_rooms, self.places)), config.num_envs,
-                                  must_see=config.room_must_see, min_distance=distance,
-                                  label_names=self.label_names,
-                                  room_objects=self.simulator.room_objects)
-        return tasks.Collect(self.places, config.num_envs, models=models, objects=config.objects)
+                               deltas=self._base.deltas)
 
     def _make_spaces(self) -> None:
         size, actions = self.config.size, len(self.action_names)
@@ -261,20 +236,16 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if self._explorer is not None:
             more |= {'explorer_seen': self._explorer.explorer.seen.copy(),
                      'explorer_found': self._explorer.explorer.found.copy()}
-        # One seed for all, as a training has it, is kept as one number.
-        alike = (self._seeds == self._seeds[0]).all() and (
-            self._numbers == np.arange(self.num_envs)).all()
-        more |= {} if alike else {'numbers': self._numbers.copy()}
-        seed = self._seeds[0] if alike else self._seeds.copy()
-        return {'poses': self.simulator.poses.copy(), 'seed': np.array(seed), **more,
+        if self._exploration is not None:
+            more['visited'] = self._exploration.visited.copy()
+        return {'poses': self.simulator.poses.copy(), **self._seeds.get_state(), **more,
                 **{name.strip('_'): getattr(self, name).copy() for name in self._state},
                 **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
                 **{f'task_{name}': part.copy() for name, part in self.task.state.items()}}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Stand where `get_state` was taken."""
-        self._seeds[:] = state['seed']
-        self._numbers[:] = state.get('numbers', np.arange(self.num_envs))
+        self._seeds.set_state(state)
         everyone = np.arange(self.num_envs)
         if self._wanders:
             self.simulator.enter(everyone, state['house_index'])
@@ -290,12 +261,18 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if self._explorer is not None:
             self._explorer.explorer.seen[:] = state['explorer_seen']
             self._explorer.explorer.found[:] = state['explorer_found']
+        if self._exploration is not None:
+            self._exploration.visited[:] = state['visited']
         for name, part in self.simulator.objects._asdict().items():
             part[:] = state[f'objects_{name}']
         for name, part in self.task.state.items():
             part[:] = state[f'task_{name}']
-        self.simulator.apply_appearance(everyone, self._seeds, Stream.APPEARANCE, self._numbers,
-                                        self._episode)
+        seeds, numbers, episodes = self._counters(everyone)
+        self.simulator.apply_appearance(everyone, seeds, Stream.APPEARANCE, numbers, episodes)
+
+    def _counters(self, env_ids: np.ndarray) -> Counters:
+        """What the random numbers of robots [K] are functions of."""
+        return self._seeds.seeds[env_ids], self._seeds.numbers[env_ids], self._episode[env_ids]
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None,
               options: dict | None = None):
@@ -309,41 +286,13 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         Raises:
             UserError: another number of seeds, or another mask, or an option that is none.
         """
-        mask = self._reset_mask(read_options(options, ('reset_mask',)))
+        mask = read_reset_mask(read_options(options, ('reset_mask',)), self._episode >= 0)
         if seed is not None:
-            self._take_seeds(seed, mask)
+            self._episode[self._seeds.take(seed, mask)] = -1
         self._begin(np.nonzero(mask)[0])
         self._done[mask] = False
         none = np.zeros(self.num_envs, bool)
         return self._result(self._look(), reset=mask, success=none, collided=none)
-
-    def _reset_mask(self, options: Mapping) -> np.ndarray:
-        """Which environments begin a new episode, [N] bool."""
-        if 'reset_mask' not in options:
-            return np.ones(self.num_envs, bool)
-        try:
-            mask = np.asarray(options['reset_mask'])
-        except ValueError:  # rows of several lengths
-            mask = np.zeros(0, bool)
-        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise UserError(f'a reset_mask is {self.num_envs} booleans, one of them true',
-                            options['reset_mask'], 'pass such an array')
-        if (self._episode[~mask] < 0).any():
-            raise UserError('every environment has begun before some of them begin again',
-                            'a reset_mask at the first reset', 'reset once without a mask')
-        return mask.copy()
-
-    def _take_seeds(self, seed: int | Sequence[int | None], mask: np.ndarray) -> None:
-        """Give seeds to the environments of the mask [N]."""
-        own = np.arange(self.num_envs)
-        if are_several(seed):
-            given, own = read_seeds(seed, self.num_envs), np.zeros_like(own)
-        else:
-            given = [read_seed(seed)] * self.num_envs
-        for n in np.nonzero(mask)[0]:
-            if (new := given[n]) is not None:
-                self._seeds[n], self._numbers[n] = new, own[n]
-                self._episode[n] = -1
 
     def step(self, actions):
         """One decision in every environment that is not being reset."""
@@ -379,8 +328,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             before, self._distance, collided, verdict.success,
             progress=self.config.progress_reward, collision=self.config.collision_reward,
             step=self.config.step_reward, goal=self.config.goal_bonus)).astype(np.float32)
-        if self.config.exploration_reward:
-            reward[acting] += self.config.exploration_reward * self._explore(acting)
+        if self._exploration is not None:
+            reward[acting] += self.config.exploration_reward * self._visit(acting)
         self._last_action[driving] = actions[driving]
         self._last_reward[acting] = verdict.reward[acting]
         terminated = ended | declared
@@ -394,29 +343,13 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """Move some robots. On a grid nothing is noisy, slips or is worn."""
         if self.simulator.capabilities.own_actions:
             return self.simulator.act(actions, acting)
-        delta = self._deltas[actions]
-        continuous = self.simulator.capabilities.continuous
-        if self.config.noise and continuous:
-            delta = motion_noise(delta, self._sizes[actions], normal(
-                self._seeds[acting], Stream.MOTION_NOISE, self._numbers[acting],
-                self._episode[acting], self._step[acting]))
-        if continuous:
-            delta = self._as_driven(delta, acting)
+        delta = (self._base.driven(actions, self._counters(acting), self._step[acting],
+                                   self._motion_scale[acting])
+                 if self.simulator.capabilities.continuous else self._base.deltas[actions])
         motion = self.simulator.move(delta, acting)
         self._path_length[acting] += (1.0 if self.simulator.capabilities.steps else np.hypot(
             motion.delta[:, 0], motion.delta[:, 1]))
         return motion
-
-    def _as_driven(self, delta: np.ndarray, env_ids: np.ndarray) -> np.ndarray:
-        """What a base with worn wheels on a smooth floor makes of displacements [K,4]."""
-        config = self.config.randomisation
-        share = self._motion_scale[env_ids]
-        if config.slip:
-            share = draw_grip(config, self._seeds[env_ids], self._numbers[env_ids],
-                              self._episode[env_ids], self._step[env_ids]) * share
-        delta = delta.copy()
-        delta[:, :3] *= share[:, None]
-        return delta
 
     def _begin(self, env_ids: np.ndarray) -> None:
         """Draw goal, start, light and base of new episodes."""
@@ -424,11 +357,12 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         teleport = self.simulator.capabilities.teleport
         if self._wanders:
             own = (len(self.places) - 1 - env_ids) // self.num_envs + 1  # n, n + N, n + 2 N, ...
-            turn = own * uniform(self._seeds[env_ids], Stream.HOUSE, self._numbers[env_ids],
-                                 self._episode[env_ids])
+            seeds, numbers, episodes = self._counters(env_ids)
+            turn = own * uniform(seeds, Stream.HOUSE, numbers, episodes)
             self.simulator.enter(env_ids, env_ids + turn.astype(np.int64) * self.num_envs)
         for n in env_ids:
-            counter = (int(self._seeds[n]), int(self._numbers[n]), int(self._episode[n]))
+            seed, number, index = self._counters(n)
+            counter = int(seed), int(number), int(index)
             episode = self.task.begin(int(n), int(self.place_index[n]), counter, self._tau,
                                       self._mode)
             variant = draw_variant(self._views.variants, *counter)
@@ -441,7 +375,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                 self.simulator.place(np.array([n]), episode.start[None])
             self.simulator.set_objects(n, episode.objects)
             self._distances.set(n, episode.field)
-        counters = self._seeds[env_ids], self._numbers[env_ids], self._episode[env_ids]
+        counters = self._counters(env_ids)
         if not teleport:
             self.simulator.spawn(env_ids, key(counters[0], Stream.START_CELL, *counters[1:]))
         self.simulator.apply_appearance(env_ids, counters[0], Stream.APPEARANCE, *counters[1:])
@@ -454,19 +388,15 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         # Where nobody knows the ways no figure is made of the shortest one.
         known = self.simulator.capabilities.geodesic
         self._start_distance[env_ids] = self._distance[env_ids] if known else np.nan
-        if self.config.exploration_reward:
-            self._visited[env_ids] = False
-            self._explore(env_ids)
+        if self._exploration is not None:
+            self._exploration.begin(env_ids)
+            self._visit(env_ids)
 
-    def _explore(self, env_ids: np.ndarray) -> np.ndarray:
-        """Which robots stand on a square of floor that is new to their episodes, [K] bool."""
-        assert isinstance(self._distances, FloorDistances)  # see `check_simulator`
-        corner = self._distances.origins[self.place_index[env_ids]]
-        at = (self.simulator.poses[env_ids, :2] - corner) / SQUARE_SIDE
-        column, row = at.astype(np.int64).T
-        new = ~self._visited[env_ids, row, column]
-        self._visited[env_ids, row, column] = True
-        return new
+    def _visit(self, env_ids: np.ndarray) -> np.ndarray:
+        """Which of robots [K] stand on floor that is new to their episodes, [K] bool."""
+        assert self._exploration is not None
+        return self._exploration.visit(env_ids, self.place_index[env_ids],
+                                       self.simulator.poses[env_ids])
 
     def _measure(self, env_ids: np.ndarray) -> None:
         """Geodesic distance of robots to their goals; 0 where the task has none."""
@@ -484,14 +414,15 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         return tasks.heading_error(self.simulator.poses[:, 2], self._goal_yaw)
 
     def _look(self) -> Frames:
-        return self.simulator.observe(keys=key(self._seeds, Stream.SENSOR, self._numbers,
-                                               self._episode, self._step))
+        seeds, numbers = self._seeds.seeds, self._seeds.numbers
+        return self.simulator.observe(keys=key(seeds, Stream.SENSOR, numbers, self._episode,
+                                               self._step))
 
     def _result(self, frames: Frames, reset, success, collided):
         image = frames.rgb.copy()
         if self.config.randomisation.late_picture:
-            late = (uniform(self._seeds, Stream.LATE_PICTURE, self._numbers, self._episode,
-                            self._step)
+            late = (uniform(self._seeds.seeds, Stream.LATE_PICTURE, self._seeds.numbers,
+                            self._episode, self._step)
                     < self.config.randomisation.late_picture) & (self._step > 0)
             image[late] = self._last_image[late]
             self._last_image[:] = image
@@ -561,7 +492,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         else:
             near = (self._distance <= tasks.ARRIVAL_RADIUS) & (self.config.task == 'image')
             if self._floor_teacher is None:
-                self._floor_teacher = FloorTeacher(self.action_names, self._deltas)
+                self._floor_teacher = FloorTeacher(self.action_names, self._base.deltas)
             actions = self._floor_teacher.actions(
                 self.simulator.poses, self._goal_yaw, near, self.simulator.reach,
                 self._distance_from)
