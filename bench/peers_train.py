@@ -58,9 +58,9 @@ class StackedEnv:
             last = {n: {name: rows[n].copy() for name, rows in stacked.items()} for n in ended}
             env._begin(ended)
             env._done[ended] = False
-            frames = env.simulator.observe(ended, key(
-                env._seeds[ended], Stream.SENSOR, env._numbers[ended], env._episode[ended],
-                env._step[ended]))
+            seeds, numbers, episodes = env._counters(ended)
+            frames = env.simulator.observe(ended, key(seeds, Stream.SENSOR, numbers, episodes,
+                                                      env._step[ended]))
             stacked['picture'][ended, :3] = frames.rgb
             stacked['picture'][ended, 3:] = env.goals[env._shown_goal[ended]]
             stacked['extra'][ended] = 0.0
