@@ -42,17 +42,17 @@ from vn_sim_bridge.robot.goal_pictures import load_goal_pictures
 from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
 from vn_sim_bridge.simulators import robot_for
 
-COMMAND_TIMEOUT = 0.5  # s of the bridge's own time without a command: the base brakes
-LOCK_STEP_TIMEOUT = 2.0  # s of wall time without a command in motion: the base brakes
-STATEMENT_PATIENCE = 2.0  # s of wall time, see _on_arrived
+COMMAND_TIMEOUT_S = 0.5  # s of the bridge's own time without a command: the base brakes
+LOCK_STEP_TIMEOUT_S = 2.0  # s of wall time without a command in motion: the base brakes
+STATEMENT_PATIENCE_S = 2.0  # s of wall time, see _on_arrived
 # s after which a node has heard of the others: Fast DDS announces itself every 3 s.
-DISCOVERY = 6.0
-LINGER = 1.0  # s after the last episode; the policy would stop after 2 without a picture
-REPORT = 1.0  # s of wall time between two messages on /diagnostics
-BEHIND = 2  # ticks lost between two of them that are worth a warning
-AT_ONCE = 10  # callbacks that are served when a tick is overdue
-CLOCK = 'clock'  # a world each, and so a time each: /clock where there is no namespace
-OWN_CLOCK = 'give each robot a namespace (-r __ns:=/robot2), and its nodes -r /clock:=clock'
+DISCOVERY_S = 6.0
+LINGER_S = 1.0  # s after the last episode; the policy would stop after 2 without a picture
+REPORT_PERIOD_S = 1.0  # s of wall time between two messages on /diagnostics
+LATE_TICKS = 2  # ticks lost between two of them that are worth a warning
+OVERDUE_CALLBACKS = 10  # callbacks that are served when a tick is overdue
+CLOCK_TOPIC = 'clock'  # a world each, and so a time each: /clock where there is no namespace
+CLOCK_REMEDY = 'give each robot a namespace (-r __ns:=/robot2), and its nodes -r /clock:=clock'
 TICK_NS = round(TICK * 1e9)
 
 
@@ -97,7 +97,7 @@ class SimBridgeNode(Node):
         self.says_arrived = self.goal_taken = False  # the policy, in this episode
         self.goal_shown = 0.0  # steady time [s]
         self._clock_publisher: Publisher | None = None  # made once nobody else has one
-        self._time_from = created + DISCOVERY
+        self._time_from = created + DISCOVERY_S
         self._make_interfaces(values)
         with compiling(self, ended, work):
             self.begin(0)
@@ -116,8 +116,9 @@ class SimBridgeNode(Node):
 
     def _other_clocks(self) -> list[str]:
         """Who else publishes on the clock's topic."""
+        topic = self.resolve_topic_name(CLOCK_TOPIC)
         names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                 for info in self.get_publishers_info_by_topic(self.resolve_topic_name(CLOCK))]
+                 for info in self.get_publishers_info_by_topic(topic)]
         # Two bridges may have one name: a name is this node's once, and only when it publishes.
         if self._clock_publisher is not None and (me := self.get_fully_qualified_name()) in names:
             names.remove(me)
@@ -134,9 +135,9 @@ class SimBridgeNode(Node):
                 return
             if others := self._other_clocks():
                 raise UserError('one node alone publishes the simulated time',
-                                f'{", ".join(others)} on {self.resolve_topic_name(CLOCK)}',
-                                OWN_CLOCK)
-            self._clock_publisher = self.create_publisher(Clock, CLOCK, offered('/clock'))
+                                f'{", ".join(others)} on {self.resolve_topic_name(CLOCK_TOPIC)}',
+                                CLOCK_REMEDY)
+            self._clock_publisher = self.create_publisher(Clock, CLOCK_TOPIC, offered('/clock'))
         self._clock_publisher.publish(Clock(clock=stamp))
 
     def _make_interfaces(self, values: dict) -> None:
@@ -175,7 +176,8 @@ class SimBridgeNode(Node):
             # Deeper than the contract: what is said of one goal and of the next are both heard.
             self.create_subscription(Bool, 'arrived', self._on_arrived, qos('arrived', depth=10))
         self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_timer(REPORT, self._report, clock=NodeClock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(REPORT_PERIOD_S, self._report,
+                          clock=NodeClock(clock_type=ClockType.STEADY_TIME))
         if self._label_names is not None:
             self._label_names.publish(String(data=json.dumps(
                 list(self.robot.simulator.label_names))))
@@ -205,7 +207,7 @@ class SimBridgeNode(Node):
 
     def _declares(self) -> bool:
         return self.says_arrived and (
-            self.goal_taken or time.monotonic() - self.goal_shown > STATEMENT_PATIENCE)
+            self.goal_taken or time.monotonic() - self.goal_shown > STATEMENT_PATIENCE_S)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         if self.free:
@@ -288,7 +290,7 @@ class SimBridgeNode(Node):
 
     def tick(self) -> None:
         """Advance by one tick under the command in force, and publish what follows."""
-        stale = (self.robot.tick_count - self.command_tick) * TICK >= COMMAND_TIMEOUT
+        stale = (self.robot.tick_count - self.command_tick) * TICK >= COMMAND_TIMEOUT_S
         declares = self._declares()
         if stale or declares:
             self.command = np.zeros(4)
@@ -346,14 +348,14 @@ class SimBridgeNode(Node):
             0, int((now - self.begun) / TICK) - self.robot.tick_count)
         state = ('all episodes done' if self.done else 'free driving' if self.free else
                  f'episode {self.index} to {self.robot.goal.room}')
-        level, words = DiagnosticStatus.OK, state
-        if behind >= self._behind_said + BEHIND:
-            level, words = DiagnosticStatus.WARN, (
+        level, summary = DiagnosticStatus.OK, state
+        if behind >= self._behind_said + LATE_TICKS:
+            level, summary = DiagnosticStatus.WARN, (
                 f'{state}: {behind - self._behind_said} ticks of {TICK} s late since the last '
                 'report: give it more time, smaller pictures or lock_step')
         self._behind_said = behind
         if fault := self._misunderstandings():
-            level, words = DiagnosticStatus.ERROR, fault
+            level, summary = DiagnosticStatus.ERROR, fault
             self.get_logger().error(fault, throttle_duration_sec=10.0)
         values = {
             'state': state, 'episode': self.index,
@@ -362,7 +364,7 @@ class SimBridgeNode(Node):
             'last_command_age': ('no command yet' if self.command_at is None else
                                  f'{now - self.command_at:.2f}')}
         message = DiagnosticArray(status=[DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(), message=words,
+            level=level, name=self.get_fully_qualified_name(), message=summary,
             hardware_id=self.robot.robot.name,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
         message.header.stamp = self.stamp()
@@ -372,7 +374,7 @@ class SimBridgeNode(Node):
         """Another clock, or commands of the type that this base does not read."""
         if self._clock_publisher is not None and (others := self._other_clocks()):
             return (f'{", ".join(others)} also publishes on {self._clock_publisher.topic_name}: '
-                    f'time jumps; {OWN_CLOCK}')
+                    f'time jumps; {CLOCK_REMEDY}')
         mine = f'geometry_msgs/msg/{self._command_type.__name__}'
         for info in self.get_publishers_info_by_topic(self._listener.topic_name):
             if info.topic_type != mine:
@@ -393,7 +395,7 @@ def run(node: SimBridgeNode, ended: Ended) -> None:
     while not ended.is_set():
         if node.done and node.exit_when_done:
             # What was said is latched: a recorder that is still being matched gets it.
-            linger = time.monotonic() + LINGER
+            linger = time.monotonic() + LINGER_S
             while time.monotonic() < linger and not ended.is_set():
                 executor.spin_once(timeout_sec=0.05)
             return
@@ -401,11 +403,11 @@ def run(node: SimBridgeNode, ended: Ended) -> None:
         moving, now = node.moves, time.monotonic()
         waits = node.lock_step and moving and not node.unanswered
         if node.lock_step:
-            next_tick = now + (LOCK_STEP_TIMEOUT if waits else TICK)
+            next_tick = now + (LOCK_STEP_TIMEOUT_S if waits else TICK)
         else:
             next_tick = max(next_tick + TICK, now)  # no tick is left out: time falls behind
         if next_tick <= now:  # a late bridge still hears a stop
-            for _ in range(AT_ONCE):
+            for _ in range(OVERDUE_CALLBACKS):
                 executor.spin_once(timeout_sec=0)
         while not ended.is_set():
             remaining = next_tick - time.monotonic()

@@ -73,7 +73,7 @@ class SimulatedRobot:
         max_decisions: limit of an episode.
         stop: 'arrival' ends an episode, or 'declared': only `declare` does, as in `EnvConfig`.
         randomisation: of light, camera and base; default: nothing varies.
-        odometry_drift: errors of odometry (`odometry.drift_errors`) beside motion noise; 0: none.
+        odometry_drift: errors of odometry (`odometry.drift_errors`) besides motion noise; 0: none.
         goal_poses: x, y [m], yaw [rad] of the goals to draw from; default: the place's.
 
     Raises:
