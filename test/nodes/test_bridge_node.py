@@ -436,7 +436,7 @@ def journey():
         if ended[0]:
             assert info['success'][0] and reward[0] == 1.0
             return deltas, arrived, int(info['decisions'][0]), false_stop
-        deltas.append(env._deltas[actions[0]])
+        deltas.append(env._base.deltas[actions[0]])
         arrived.append(bool(info['arrived'][0]))
 
 
@@ -533,7 +533,7 @@ def test_fifty_action_sequences_end_where_navigation_env_ends(tmp_path):
         assert len(chosen) == recorded.episode.decisions
         env.simulator.place(np.array([0]), np.array([recorded.facts['start']]))
         for action in chosen:
-            env.simulator.move(env._deltas[[action]])
+            env.simulator.move(env._base.deltas[[action]])
         x, y, yaw = recorded.trajectory[-1]
         distances.append(np.hypot(*(env.simulator.poses[0, :2] - (x, y))))
         turns.append(abs(np.degrees(wrap_angle(env.simulator.poses[0, 2] - yaw))))
