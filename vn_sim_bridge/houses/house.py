@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import FloorMap, Rect, Room, floor_map
+from vn_sim_bridge.floor.on_floor import OnFloor
 from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.simulator import Goal
 
@@ -23,7 +23,7 @@ class Obstacle(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class House:
+class House(OnFloor):
     """One house, the same for every run of the same generator version and seed."""
 
     name: str
@@ -49,25 +49,6 @@ class House:
     def floor(self) -> FloorMap:
         """Where the robot can stand."""
         return floor_map(self.outline, self.obstacle_rects, self.footprint_radius)
-
-    def geodesic(self, x: float, y: float) -> FloorDistance:
-        """Shortest driving distance from anywhere to (x, y)."""
-        return FloorDistance(self.floor, x, y)
-
-    def distance_to(self, goal: Goal) -> FloorDistance:
-        """Shortest driving distance from anywhere to a goal."""
-        return self.geodesic(*goal.pose[:2])
-
-    def starts(self) -> tuple[np.ndarray, None]:
-        """Where episodes may begin, see `Place`: anywhere, facing anywhere."""
-        return self.floor.centres(), None
-
-    def room_at(self, x: float, y: float) -> str:
-        """Name of the room that holds a point; '' inside walls and doors."""
-        for room in self.rooms:
-            if room.rect.x0 <= x <= room.rect.x1 and room.rect.y0 <= y <= room.rect.y1:
-                return room.name
-        return ''
 
     def plan(self) -> dict:
         """What a map needs of the house, ready for JSON; lengths in m, poses as in `Goal`."""

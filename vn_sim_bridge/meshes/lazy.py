@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import FloorMap, Rect
+from vn_sim_bridge.floor.on_floor import OnFloor
 from vn_sim_bridge.houses.house import Room
 from vn_sim_bridge.meshes.place import MeshPlace
 from vn_sim_bridge.render.rasterizer import Rasterizer
@@ -78,7 +78,7 @@ class PlaceCache:
         self._kept.clear()
 
 
-class LazyPlace:
+class LazyPlace(OnFloor):
     """A `MeshPlace` by its number: goals, rooms and floor stay, the rest may have to be read.
 
     Args:
@@ -133,22 +133,6 @@ class LazyPlace:
     def obstacle_rects(self) -> np.ndarray:
         """[M,4] x0, y0, x1, y1 [m] of every obstacle."""
         return self.whole.obstacle_rects
-
-    def geodesic(self, x: float, y: float) -> FloorDistance:
-        """Shortest driving distance from anywhere to (x, y)."""
-        return FloorDistance(self.floor, x, y)
-
-    def distance_to(self, goal: Goal) -> FloorDistance:
-        """Shortest driving distance from anywhere to a goal."""
-        return self.geodesic(*goal.pose[:2])
-
-    def starts(self) -> tuple[np.ndarray, None]:
-        """Where episodes may begin: anywhere, facing anywhere."""
-        return self.floor.centres(), None
-
-    def room_at(self, x: float, y: float) -> str:
-        """Name of the room that holds a point; '' where none does."""
-        return self.whole.room_at(x, y)
 
     def plan(self) -> dict:
         """What a map needs, see `House.plan`."""

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vn_nav.robot import RobotSpec
-from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import FloorMap, Rect
 from vn_sim_bridge.floor.mesh_floor import (
     HEIGHT,
@@ -22,6 +21,7 @@ from vn_sim_bridge.floor.mesh_floor import (
     mesh_floor,
     rectangles_of_polygons,
 )
+from vn_sim_bridge.floor.on_floor import OnFloor
 from vn_sim_bridge.houses.house import Room
 from vn_sim_bridge.meshes.goals import mesh_goals
 from vn_sim_bridge.render.mesh_scene import Surface, mesh_scene
@@ -43,7 +43,7 @@ class RoomOutline(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class MeshPlace:
+class MeshPlace(OnFloor):
     """Has what a `House` has for tasks, contacts and maps (`floor.places.RoomPlace`).
 
     A room that is no rectangle is several ones of one name in `rooms`.
@@ -59,25 +59,6 @@ class MeshPlace:
     area: float  # m^2, of the free floor
     footprint_radius: float  # m, of the robot that the floor map is for
     level: float  # m, height of the floor in the frame of the file
-
-    def geodesic(self, x: float, y: float) -> FloorDistance:
-        """Shortest driving distance from anywhere to (x, y)."""
-        return FloorDistance(self.floor, x, y)
-
-    def distance_to(self, goal: Goal) -> FloorDistance:
-        """Shortest driving distance from anywhere to a goal."""
-        return self.geodesic(*goal.pose[:2])
-
-    def starts(self) -> tuple[np.ndarray, None]:
-        """Where episodes may begin, see `Place`: anywhere, facing anywhere."""
-        return self.floor.centres(), None
-
-    def room_at(self, x: float, y: float) -> str:
-        """Name of the room that holds a point; '' where none does."""
-        for room in self.rooms:
-            if room.rect.x0 <= x <= room.rect.x1 and room.rect.y0 <= y <= room.rect.y1:
-                return room.name
-        return ''
 
     def plan(self) -> dict:
         """What a map needs, see `House.plan`."""

@@ -10,6 +10,7 @@ says of transparency has no effect.
 
 from __future__ import annotations
 
+import abc
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -141,7 +142,7 @@ def surfaces_of(parts: Sequence[Part], matrix: np.ndarray, mirrored: bool, scale
         instance) for part in parts)
 
 
-class _Reader:
+class _Reader(abc.ABC):
     def __init__(self, data: Path, house: HouseFile, level: Level, categories: Categories):
         self.data, self.house, self.level, self.categories = data, house, level, categories
         self._parts: dict[Path, list[Part]] = {}
@@ -188,9 +189,9 @@ class _Reader:
         """Whether its transform turns triangles inside out."""
         return node.mirrored or float(np.linalg.det(node.transform[:3, :3])) < 0
 
+    @abc.abstractmethod
     def pieces(self) -> list[Piece]:
         """All that is to be seen."""
-        raise NotImplementedError
 
 
 class _Published(_Reader):
