@@ -1,10 +1,11 @@
 """Steps/s of any simulator with 1 and 16 environments, its reset time and its memory.
 
+    python bench/simulators.py                                        # a scene of every simulator
     python bench/simulators.py --scene dmlab:maze?seed=3 --scene house:7
 
-84 px RGB and depth (and labels, where there are any), random actions, one drawing thread. Each
-row runs in a process of its own. Memory is that of all processes, shared pages split among them.
-Simulators that pay reset within `spawn`; all others place their robots.
+84 px RGB, depth and labels, as far as there are any; random actions, one drawing thread. Each
+figure comes from a process of its own. Memory is that of all its processes, shared pages split
+among them. Simulators that pay reset within `spawn`; all others place their robots.
 """
 
 import argparse
@@ -13,6 +14,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+
+from simulator_scenes import SCENES, scene
 
 ENVS = (1, 16)
 WARM = 20  # steps before the clock starts
@@ -42,14 +45,13 @@ def memory_mb() -> float:
     return total / 1024
 
 
-def measure(scene: str, envs: int, seconds: float) -> dict:
+def measure(name: str, envs: int, seconds: float) -> dict:
     """Figures of one scene with so many environments."""
     import numpy as np
 
-    from vn_sim_bridge.navigation.env import NavigationEnv
-    from vn_sim_bridge.navigation.env_config import EnvConfig
+    from vn_nav.cli.world import make_env
     begun = time.perf_counter()
-    env = NavigationEnv(EnvConfig(scenes=(scene,), num_envs=envs))
+    env = make_env((name,), envs, privileged=('depth', 'segmentation'), may_lack=())
     opened = time.perf_counter() - begun
     begun = time.perf_counter()
     env.reset(seed=0)
@@ -65,7 +67,7 @@ def measure(scene: str, envs: int, seconds: float) -> dict:
     while (spent := time.perf_counter() - begun) < seconds:
         env.step(actions[count % 1000])
         count += 1
-    found = {'steps/s': count * envs / spent, 'open s': opened,
+    found = {'told': ('rgb', *env.config.privileged), 'steps/s': count * envs / spent, 'open s': opened,
              'reset ms': 1000 * float(np.median(resets)) / envs, 'MB': memory_mb()}
     env.close()
     return found
@@ -74,7 +76,9 @@ def measure(scene: str, envs: int, seconds: float) -> dict:
 def main():
     """Rows of a table in Markdown, and one line of JSON each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--scene', action='append', required=True)
+    parser.add_argument('--scene', action='append', help='default: one of every simulator')
+    parser.add_argument('--files', type=Path, default=Path('runs/simulators/files'),
+                        help='folder for scenes that are made here')
     parser.add_argument('--seconds', type=float, default=10.0)
     parser.add_argument('--envs', type=int, help=argparse.SUPPRESS)  # in a process of its own
     arguments = parser.parse_args()
@@ -82,21 +86,18 @@ def main():
         print(json.dumps(measure(arguments.scene[0], arguments.envs, arguments.seconds)))
         return
     from vn_nav.cli.world import machine
-    rows = []
-    for scene in arguments.scene:
+    print('| scene | steps/s, 1 environment | 16 environments | opening 1 / 16 | reset of one | '
+          'memory 1 / 16 |\n|---|---|---|---|---|---|', flush=True)
+    for name in arguments.scene or [scene(name, arguments.files) for name in SCENES]:
         one, many = (json.loads(subprocess.run(
-            [sys.executable, __file__, '--scene', scene, '--envs', str(envs), '--seconds',
+            [sys.executable, __file__, '--scene', name, '--envs', str(envs), '--seconds',
              str(arguments.seconds)], stdout=subprocess.PIPE, text=True,
             check=True).stdout.splitlines()[-1]) for envs in ENVS)
-        rows.append((scene, one, many))
-        print(json.dumps({'scene': scene, '1': one, '16': many, 'machine': machine()}),
+        print(json.dumps({'scene': name, '1': one, '16': many, 'machine': machine()}),
               file=sys.stderr, flush=True)
-    print('| scene | steps/s, 1 environment | 16 environments | opening 1 / 16 | reset of one | '
-          'memory 1 / 16 |\n|---|---|---|---|---|---|')
-    for scene, one, many in rows:
-        print(f'| `{scene}` | {one["steps/s"]:,.0f} | {many["steps/s"]:,.0f} | '
-              f'{one["open s"]:.1f} / {many["open s"]:.1f} s | {many["reset ms"]:.1f} ms | '
-              f'{one["MB"]:,.0f} / {many["MB"]:,.0f} MB |')
+        print(f'| `{name}`: {", ".join(one["told"])} | {one["steps/s"]:,.0f} | '
+              f'{many["steps/s"]:,.0f} | {one["open s"]:.1f} / {many["open s"]:.1f} s | '
+              f'{many["reset ms"]:.1f} ms | {one["MB"]:,.0f} / {many["MB"]:,.0f} MB |', flush=True)
 
 
 if __name__ == '__main__':

@@ -1,6 +1,7 @@
 """The command line: bad input is one line, exit code 2, and nothing half-written."""
 
 import json
+import signal
 import subprocess
 import sys
 
@@ -16,6 +17,14 @@ from vn_sim_bridge.simulators.house import WORLD_VERSION
 def run(*words):
     return subprocess.run([sys.executable, '-m', 'vn_nav.cli', *map(str, words)],
                           capture_output=True, text=True, timeout=100)
+
+
+def test_a_reader_that_goes_away_ends_a_command_without_a_traceback():
+    with subprocess.Popen([sys.executable, '-m', 'vn_nav.cli', 'simulators'], text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+        command.stdout.close()
+        assert command.stderr.read() == ''
+    assert command.returncode == 128 + signal.SIGPIPE
 
 
 def _config(folder):

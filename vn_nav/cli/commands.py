@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
+import signal
 import sys
+from typing import TextIO
 
 from vn_nav import __version__
 from vn_nav.errors import UserError
@@ -49,6 +52,15 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     return parser
 
 
+def _has_reader(stream: TextIO) -> bool:
+    """Whether what was written so far finds its reader."""
+    try:
+        stream.flush()
+    except BrokenPipeError:
+        return False
+    return True
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point: 2 and one line on standard error for bad input."""
     arguments = sys.argv[1:] if argv is None else argv
@@ -56,7 +68,15 @@ def main(argv: list[str] | None = None) -> int:
     command = next((part for part in arguments if not part.startswith('-')), '')
     args = build_parser(command).parse_args(arguments)
     try:
-        return args.run(args)
+        code = args.run(args)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        if _has_reader(sys.stdout):
+            raise
+        # As `| head` does; what is still buffered goes nowhere, or Python's end would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except UserError as error:
         print(f'vn_nav: {error}', file=sys.stderr)
         return 2

@@ -68,7 +68,8 @@ def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions
     """A result without splits: what all of them have in common.
 
     Args:
-        info: of the checkpoint; its `sha256` is left out where the weights still change.
+        info: of the checkpoint, with the simulator and the world version that are measured in;
+            its `sha256` is left out where the weights still change.
         checkpoint: its name.
         bag: name of the recorded drive; None: scenes of a simulator.
         max_decisions: of an episode.
@@ -136,17 +137,19 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
     for split, scenes in splits.items():
         plans = done.plans[split] = {}
         limits: list[int] = []
+        world: dict[str, str] = {}
 
         def make(names: Sequence[str], environments: int, stop: str, split: str = split,
-                 plans: dict = plans, limits: list[int] = limits):
+                 plans: dict = plans, limits: list[int] = limits, world: dict = world):
             env = make_env(split, names, environments, stop)
+            world.update(simulator=env.simulator_name, world_version=env.world_version)
             plans.update({place.name: place.plan() for place in env.places})
             limits.append(env.config.max_decisions)
             return env
 
         measured = done.measured[split] = measure_checkpoint(checkpoint, scenes, make, config)
         done.result = done.result or new_result(
-            checkpoint.info, checkpoint=name, bag=bag, max_decisions=limits[0],
+            {**checkpoint.info, **world}, checkpoint=name, bag=bag, max_decisions=limits[0],
             decoding=config.decoding or checkpoint.info['decoding'], seed=config.seed)
         done.result['splits'][split] = evaluator.split_figures(measured, scenes)
         on_split(split, done.result)

@@ -55,7 +55,8 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
     body = ''.join(_split(name, split, measured[name], plans[name], result, maps)
                    for name, split in result['splits'].items())
     return page('vn_nav evaluate', f"""<h1>{html.escape(result['checkpoint'])}</h1>
-<p class="soft">World version {html.escape(str(result['world_version']))}, task
+<p class="soft">Simulator {html.escape(str(result['simulator']))}, world version
+{html.escape(str(result['world_version']))}, task
 {html.escape(result['task'])}, actions by the rule <i>{result['decoding']}</i>, at most
 {result['max_decisions']} decisions an episode, seed {result['seed']}. vn_nav {__version__},
 {result['date']}.</p>
