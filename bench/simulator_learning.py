@@ -163,3 +163,7 @@ def main():
     done = [task for task in TASKS if (CURVES / task / 'evaluation.json').exists()]
     chart(done)
     table(done)
+
+
+if __name__ == '__main__':
+    main()

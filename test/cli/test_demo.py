@@ -146,15 +146,20 @@ def test_the_control_without_ros_is_shown_the_goal_pictures_of_the_bag(demo):
             assert k == 0 or len(recorded.pictures) == len(numbers)
 
 
-def test_it_drives_in_a_scene_of_another_simulator(tmp_path, monkeypatch):
+@pytest.mark.parametrize('simulator', ['examples.corridor', 'gltf'])
+def test_it_drives_in_a_scene_of_another_simulator(tmp_path, monkeypatch, simulator):
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
         [str(ROOT), os.environ.get('PYTHONPATH', '')]))
-    scene = 'examples.corridor:5'
+    scene = f'{simulator}:5'
+    if simulator == 'gltf':
+        file = tmp_path / 'my flat.glb'
+        assert main(['house', 'export', '--seed', '5', '--rooms', '2', '--out', str(file)]) == 0
+        scene = f'gltf:{file}'
     assert main(['demo', '--out', str(tmp_path), '--scene', scene, '--episodes', '1']) == 0
     result = json.loads((tmp_path / 'result.json').read_text())
     assert 'trained' not in result and result['unseen']['scene'] == scene
-    assert result['unseen']['episodes'] == 1 and 0 < result['unseen']['decisions'] <= 100
+    assert result['unseen']['episodes'] == 1 and 0 < result['unseen']['decisions'] <= 300
     (drive,) = drives_from_bag(tmp_path / 'bag')
-    assert drive.scene['simulator'] == 'examples.corridor' and len(drive.episodes) == 1
+    assert drive.scene['simulator'] == simulator and len(drive.episodes) == 1
     page = (tmp_path / 'report.html').read_text()
     assert 'A scene it has never seen' in page and scene in page and 'house it' not in page

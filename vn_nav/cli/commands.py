@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import select
 import signal
 import sys
 from typing import TextIO
@@ -53,12 +54,10 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
 
 def _has_reader(stream: TextIO) -> bool:
-    """Whether what was written so far finds its reader."""
-    try:
-        stream.flush()
-    except BrokenPipeError:
-        return False
-    return True
+    """Whether someone can still read what is written: not so after `| head`."""
+    poll = select.poll()
+    poll.register(stream.fileno(), 0)
+    return not any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -41,7 +41,7 @@ from vn_sim_bridge.simulators import simulator_class
 if TYPE_CHECKING:
     from vn_nav.nodes.demo_watch import EndedEpisode
 
-TRAINED_LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode
+LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode; the second for a policy of one house
 UNSEEN_HOUSE = 8  # seed, of a house with as many rooms as the trained one
 SEED = 2026  # of starts, goals and light
 BASE = 'config/robots/demo_base.yaml'
@@ -59,12 +59,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--episodes', type=int, default=20,
                         help='in the trained scene, or in that of --scene')
     parser.add_argument('--unseen-episodes', type=int, default=10, help='in an unseen house')
-    parser.add_argument('--checkpoint', type=Path, help='instead of the shipped policy')
+    parser.add_argument('--checkpoint', type=Path, help='instead of the shipped policy of one '
+                        'house, and with --scene of the one of any house')
 
 
 def run(args: argparse.Namespace) -> int:
     """`vn_nav demo`."""
-    folder = args.checkpoint or share_file('models/house')
+    folder = args.checkpoint or share_file('models/anywhere' if args.scene else 'models/house')
     task = load_for_scenes(folder)[0].info['task']  # refuse before anything is written
     if task != 'image':
         raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
@@ -155,12 +156,12 @@ def _places(info: dict, scene: str | None, episodes: int, unseen_episodes: int
         check_version(info, simulator=simulator)
         known = scene in info['scenes']
         return [('trained' if known else 'unseen', scene, episodes,
-                 TRAINED_LIMIT if known else UNSEEN_LIMIT)]
+                 LIMIT if known or len(info['scenes']) > 1 else UNSEEN_LIMIT)]
     if not info['scenes']:
         raise UserError('the demo drives in the scene of the training', 'a checkpoint that names '
                         'none', 'give --scene')
     trained = info['scenes'][0]
-    places = [('trained', trained, episodes, TRAINED_LIMIT)]
+    places = [('trained', trained, episodes, LIMIT)]
     if parse_scene(trained).simulator == HOUSE:  # of which there are always others
         places.append(('unseen', house_scene(UNSEEN_HOUSE, rooms_of(trained)), unseen_episodes,
                        UNSEEN_LIMIT))
