@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     named = parse_scene(unseen).place if info['simulator'] == HOUSE else unseen
     save_checkpoint(args.target, checkpoint.network, info, half=True)
     shipped = load_checkpoint(args.target)  # measure what ships: the rounded weights
-    if 'arrival' in shipped.config.heads:
+    if shipped.config.declares:
         info['stop_threshold'] = _stop_threshold(shipped, args)
         save_checkpoint(args.target, shipped.network, info, half=True)
         shipped = load_checkpoint(args.target)

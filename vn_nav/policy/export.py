@@ -51,6 +51,7 @@ from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import SEARCH
 
 POLICY, GOAL, README = 'policy.onnx', 'goal.onnx', 'README.md'
 OPSET = 17
@@ -68,8 +69,13 @@ def export_onnx(checkpoint: LoadedCheckpoint, folder: str | Path) -> list[Path]:
         how they are used.
 
     Raises:
-        UserError: the package onnx is not installed, or the folder cannot be written.
+        UserError: a policy that is more than a network; the package onnx is not installed, or the
+            folder cannot be written.
     """
+    if checkpoint.config.architecture == SEARCH:
+        raise UserError('an export holds whole decisions as one network',
+                        'a policy of the architecture search: a planner on its map decides',
+                        'run it with vn_nav, or export a policy of another preset')
     step, folder = _Step(checkpoint.network), Path(folder)
     models: dict[str, tuple[nn.Module, dict[str, Tensor], list[str]]] = {
         POLICY: (step, step.example, step.output_names)}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from vn_nav.policy.action_filter import NONE
+from vn_nav.policy.network_config import SEARCH
 
 
 def model_card(config: dict, parameters: int, size: int) -> str:
     """The README of a checkpoint, from the content of its `config.json`."""
     network = config['network']
     side, scenes = network['size'], config['scenes']
+    searches = network['architecture'] == SEARCH
     home = 'its training environment'
     if scenes:
         home = (f'{len(scenes)} scene{"s" * (len(scenes) > 1)} ({", ".join(scenes[:8])}'
@@ -17,8 +19,9 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         'Input': f'RGB {side} x {side} from a camera {config["camera_height"]:g} m above the '
                  f'floor, {config["camera_fov_deg"]:g} deg field of view; the goal picture alike',
         'Actions': ', '.join(config['action_names']),
-        'Decoding': {'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
-            config['decoding']],
+        **({} if searches else {'Decoding': {
+            'sample': 'sampled from the policy', 'greedy': 'the likeliest action'}[
+            config['decoding']]}),
         'Network': f'{_describe(network)}; {parameters:,} parameters, {size / 1e6:.1f} MB',
         **({'Action filter': 'blocked actions: an action without progress is not repeated '
             'from the same place; part of every figure (docs/method.md)'}
@@ -31,12 +34,7 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         'World version': config['world_version'],
         'Weights': f'SHA-256 `{config["sha256"]}`',
     }
-    purpose = ('Drives a robot to the place where a picture was taken.' if not config['losses']
-               else 'Weights to begin a training with (`vn_nav train --init`), pre-trained on '
-               'recorded pictures. No episode was driven: whether it arrives is not known.')
-    lines = ['# Visual navigation policy', '',
-             f'{purpose} It sees its camera, the goal picture and its own last action; no map, no '
-             'depth, no pose.', '',
+    lines = ['# Visual navigation policy', '', _purpose(config, searches), '',
              '| | |', '|---|---|', *(f'| {key} | {value} |' for key, value in facts.items())]
     if config['command']:
         lines += ['', 'Trained with', '', '```', str(config['command']), '```']
@@ -47,6 +45,21 @@ def model_card(config: dict, parameters: int, size: int) -> str:
     return '\n'.join(lines) + '\n'
 
 
+def _purpose(config: dict, searches: bool) -> str:
+    """What it does, and what it is given for that."""
+    if searches:
+        return ('Drives a robot to the place where a picture was taken: its networks see in each '
+                'picture how far the place is free and where the goal stands; a map of the place, '
+                'drawn along the way from these and from odometry, and a planner on it decide. It '
+                'is given its camera, the goal picture and odometry, or else its own last action; '
+                'no map beforehand, no depth.')
+    purpose = ('Drives a robot to the place where a picture was taken.' if not config['losses']
+               else 'Weights to begin a training with (`vn_nav train --init`), pre-trained on '
+               'recorded pictures. No episode was driven: whether it arrives is not known.')
+    return (f'{purpose} It sees its camera, the goal picture and its own last action; no map, no '
+            'depth, no pose.')
+
+
 def _describe(network: dict) -> str:
     """A short description of the network."""
     if network['architecture'] == 'icra2017':
@@ -54,6 +67,11 @@ def _describe(network: dict) -> str:
                   'given': "ResNet-50 in the scenes' files"}[network['frozen']]
         return (f'Zhu et al. 2017 on frozen features of {frozen}; {network["frames"]} stacked '
                 f'frames; layers for {network["scenes"]} scene{"s" * (network["scenes"] > 1)}')
+    if network['architecture'] == SEARCH:
+        return (f'convolutions {" / ".join(map(str, network["channels"]))}, picture and goal '
+                f'compared place by place (correlation volume), {network["blocks"]} residual '
+                f'block(s), {network["features"]} features: pose of the goal, co-visibility, '
+                'arrival; and ranges of the first obstacle along 32 bearings')
     convolutions = f'convolutions {" / ".join(map(str, network["channels"]))}, picture and goal'
     features = f'{network["features"]} features'
     parts = [{'thesis': "the thesis's two streams", 'unreal': "UNREAL's single stream",

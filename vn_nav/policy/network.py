@@ -16,7 +16,7 @@ from vn_nav.observation import Observation
 from vn_nav.policy.encoders import Encoder
 from vn_nav.policy.heads import Pose, grown
 from vn_nav.policy.memory import Feedforward, GoalTracker, MaskedLSTM, RecurrentState, stack_frames
-from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.network_config import SEARCH, NetworkConfig
 from vn_nav.policy.network_parts import PUBLISHED, build_encoder, build_head, initialise
 from vn_nav.policy.places import PLACE_FEATURES, MultiViewAveraging, PathAdvice, PlaceClassifier
 from vn_nav.policy.zhu import SceneLinear, Siamese
@@ -48,7 +48,8 @@ class Latents(NamedTuple):
 class Policy(nn.Module):
     """An encoder, a memory, actor and critic (thesis, figure 4.1), and heads.
 
-    One of icra2017 is a `vn_nav.policy.zhu_policy.ScenePolicy`; `build_policy` there makes either.
+    One of icra2017 is a `vn_nav.policy.zhu_policy.ScenePolicy`, one of search a
+    `vn_nav.policy.search.network.SearchPolicy`; `zhu_policy.build_policy` makes any.
 
     Attributes:
         frozen: whether pictures pass an encoder that learns nothing before anything else.
@@ -77,8 +78,8 @@ class Policy(nn.Module):
 
     def _build(self, config: NetworkConfig) -> None:
         """The parts."""
-        if config.architecture == 'icra2017':
-            raise UserError('a policy of icra2017 is made by zhu_policy.build_policy',
+        if config.architecture in ('icra2017', SEARCH):
+            raise UserError('a policy of icra2017 or search is made by zhu_policy.build_policy',
                             config.architecture, 'call that')
         thesis = config.architecture in PUBLISHED
         self.encoder = encoder = build_encoder(config)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from vn_nav.errors import UserError
 from vn_nav.labels import CLASSES, MAX_CLASSES
 from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
 from vn_nav.policy.zhu import FROZEN
 
-ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017')
+SEARCH = 'search'  # the architecture of `vn_nav.policy.search`
+ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017', SEARCH)
 # Channels that each image head draws, and the width of its inner maps. The thesis says that depth
 # has "only" 32, so the segmentation heads are wider.
 IMAGE_HEADS = {'depth': (1, 32), 'segmentation': (3, 64), 'goal_segmentation': (3, 64),
@@ -52,6 +54,9 @@ class NetworkConfig:
     # Of icra2017 alone.
     frozen: str = ''  # encoder, of `vn_nav.policy.zhu.FROZEN`
     scenes: int = 1  # that have layers of their own
+    # Of search alone: what its map is drawn by. 0: not given.
+    view: float = 0.0  # horizontal field of view of the camera [rad]
+    footprint: float = 0.0  # radius of the robot [m]
 
     def __post_init__(self):
         for name in ('actions', 'channels', 'heads'):
@@ -80,7 +85,8 @@ class NetworkConfig:
              self.deconvolutions),
             (not self.pose_to_memory or 'goal_pose' in self.heads,
              'pose_to_memory needs the head goal_pose', self.heads),
-            (not self.moves or (self.pose_to_memory and self.frames == 1),
+            (not self.moves or self.architecture == SEARCH
+             or (self.pose_to_memory and self.frames == 1),
              'a goal is tracked by a network with pose_to_memory and an LSTM', self.heads),
             (not self.moves or (len(self.moves) == len(self.actions)
                                 and all(len(move) == 3 for move in self.moves)),
@@ -101,6 +107,24 @@ class NetworkConfig:
              self.architecture),
             (self.architecture != 'icra2017' or not self.heads,
              'the architecture icra2017 has no heads but actor and critic', self.heads),
+            (self.architecture != SEARCH or not self.heads,
+             'the architecture search has heads of its own alone', self.heads),
+            (self.architecture != SEARCH or (self.frames == 1 and not self.places),
+             'the architecture search sees one picture at a time and no place cells',
+             (self.frames, self.places)),
+            (self.architecture != SEARCH or bool(self.moves),
+             'the architecture search plans with the moves of its actions', self.moves),
+            (self.architecture != SEARCH or self.filter_name == NONE,
+             'the architecture search has no action filter: contacts are on its map',
+             self.action_filter),
+            (self.architecture != SEARCH or self.size >= 40,
+             'the architecture search takes pictures of at least 40 pixels a side', self.size),
+            (0 < self.view < math.pi if self.architecture == SEARCH else self.view == 0,
+             'view, the field of view, lies between 0 and pi for the architecture search, and is '
+             'left out for others', self.view),
+            (0 < self.footprint <= 10 if self.architecture == SEARCH else self.footprint == 0,
+             "footprint, the robot's radius, lies between 0 and 10 m for the architecture search, "
+             'and is left out for others', self.footprint),
         )
         for kept, rule, received in rules:
             if not kept:
@@ -112,5 +136,10 @@ class NetworkConfig:
         return self.action_filter or self._usual_filter
 
     @property
+    def declares(self) -> bool:
+        """Whether the policy says how likely it has arrived, and so can declare its stop."""
+        return 'arrival' in self.heads or self.architecture == SEARCH
+
+    @property
     def _usual_filter(self) -> str:
-        return BLOCKED_ACTIONS if self.moves else NONE
+        return BLOCKED_ACTIONS if self.moves and self.architecture != SEARCH else NONE

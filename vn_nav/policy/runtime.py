@@ -16,6 +16,7 @@ from vn_nav.policy.checkpoint_info import DECODINGS
 from vn_nav.policy.goal_maps import GoalMaps
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.zhu import check_scenes
 from vn_nav.policy.zhu_policy import ScenePolicy
 
@@ -94,7 +95,7 @@ class PolicyRuntime:
         _check_decoding(self.decoding)
         self.stop_threshold: float | None = (
             checkpoint.info['stop_threshold'] if stop_threshold is None else stop_threshold)
-        _check_stop_threshold(self.stop_threshold, checkpoint.config.heads)
+        _check_stop_threshold(self.stop_threshold, checkpoint.config)
         self.arrival = math.nan
         torch.set_num_threads(1)
         self.size: int = checkpoint.config.size
@@ -268,12 +269,13 @@ def _check_decoding(decoding: str) -> None:
         raise UserError('decoding is sample or greedy', decoding, 'choose one of them')
 
 
-def _check_stop_threshold(threshold: float | None, heads: tuple[str, ...]) -> None:
+def _check_stop_threshold(threshold: float | None, config: NetworkConfig) -> None:
     if threshold is None:
         return
     if not 0 <= threshold <= 1:
         raise UserError('the stop threshold lies in [0, 1]', threshold, 'choose a value in range')
-    if threshold < 1 and 'arrival' not in heads:
-        raise UserError('a policy that declares its stop has the head arrival',
-                        f'stop threshold {threshold:g}, heads {", ".join(heads) or "none"}',
+    if threshold < 1 and not config.declares:
+        raise UserError('a policy that declares its stop has the head arrival, or searches',
+                        f'stop threshold {threshold:g}, architecture {config.architecture}, '
+                        f'heads {", ".join(config.heads) or "none"}',
                         'leave the threshold out, or train with the head')

@@ -12,13 +12,15 @@ from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Latents, Policy, PolicyOutput
-from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.network_config import SEARCH, NetworkConfig
+from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.zhu import SceneLinear, Siamese
 
 
 def build_policy(config: NetworkConfig) -> Policy:
     """The network of a configuration, whatever its architecture, with random weights."""
-    return (ScenePolicy if config.architecture == 'icra2017' else Policy)(config)
+    kinds: dict[str, type[Policy]] = {'icra2017': ScenePolicy, SEARCH: SearchPolicy}
+    return kinds.get(config.architecture, Policy)(config)
 
 
 class ScenePolicy(Policy):

@@ -1,0 +1,163 @@
+"""The networks of `search`: one that recognises the goal, one that sees how far the place is free.
+
+Shapes: N pictures, G distinct goals, S side of the square pictures [pixels], F features.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vn_nav.errors import UserError
+from vn_nav.observation import Observation
+from vn_nav.policy.encoders import Matching, Pixels, apply, channels_last, orthogonal
+from vn_nav.policy.heads import NEAR
+from vn_nav.policy.memory import RecurrentState
+from vn_nav.policy.network import Latents, Policy, PolicyOutput
+from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.search.look import BINS, COLUMNS, Look
+
+LOG_SCALES = -3.5, 2.0  # of the position, log of metres: 0.03 to 7.4 m
+LOG_CONCENTRATIONS = -3.0, 6.0  # of the heading: from all but uniform to 3 degrees
+PER_AXIS = math.sqrt(3.0)  # deviation along an axis, in scales of the position's distribution
+
+
+class Recognition(NamedTuple):
+    """Where the goal of N pairs stands, as distributions; float32.
+
+    The position's density falls as exp(-distance / scale) about its centre, in the plane; the
+    heading's is von Mises'.
+    """
+
+    position: Tensor  # [N,2] x forward, y left [m]
+    log_scale: Tensor  # [N] of the position [log m]
+    heading: Tensor  # [N,2] cos, sin of the goal's heading less the robot's
+    log_concentration: Tensor  # [N] of the heading
+    co_visible: Tensor  # [N] logit
+    arrived: Tensor  # [N] logit
+
+
+class Recogniser(nn.Module):
+    """Says `Recognition` by the features of a compared pair."""
+
+    OUTPUTS = 8
+
+    def __init__(self, features: int, width: int = 256):
+        super().__init__()
+        self.hidden = nn.Linear(features, width)
+        self.out = nn.Linear(width, self.OUTPUTS)
+        orthogonal(self)
+        nn.init.orthogonal_(self.out.weight, 0.1)
+
+    def forward(self, features: Tensor) -> Recognition:
+        """Of features [N,F]."""
+        out = apply(self.out, F.relu(apply(self.hidden, features))).float()
+        # In the order of `vn_nav.policy.heads.GoalPose` first, whose weights may begin this.
+        return Recognition(NEAR * out[:, :2], out[:, 5].clamp(*LOG_SCALES),
+                           F.normalize(out[:, 2:4], dim=1, eps=1e-6),
+                           (1 + out[:, 6]).clamp(*LOG_CONCENTRATIONS), out[:, 4], out[:, 7] - 1)
+
+
+class Ranges(nn.Module):
+    """Range of the first obstacle along `COLUMNS` bearings, from a picture alone.
+
+    Convolutions 5x5, then 3x3 three times, halve the rows each time; only the first halves the
+    columns, so that 64 pixels leave 4 rows of 32 columns. One over all four rows and five columns,
+    and a 1x1 convolution, read them.
+    """
+
+    ROWS = 4
+
+    def __init__(self, mean: float, std: float, channels: tuple[int, ...] = (16, 32, 48, 64),
+                 width: int = 128):
+        super().__init__()
+        self.first = Pixels(3, channels[0], 6, 2, mean, std)
+        self.narrow = nn.ModuleList(
+            nn.Conv2d(a, b, 3, (2, 1), 1) for a, b in zip(channels, channels[1:], strict=False))
+        self.read = nn.Conv2d(channels[-1], width, (self.ROWS, 5), 1, (0, 2))
+        self.out = nn.Conv2d(width, BINS, 1)
+        orthogonal(self)
+        nn.init.orthogonal_(self.out.weight, 0.1)
+        channels_last(self)
+
+    def forward(self, image: Tensor, dtype: torch.dtype) -> Tensor:
+        """Log-probabilities [N,COLUMNS,BINS] float32 of pictures [N,3,S,S] uint8."""
+        # Repeated edges: padding by zeros would be pixels far darker than any.
+        x = F.pad(image.to(dtype), (2, 2, 2, 2), mode='replicate')
+        x = F.relu(self.first(x, dtype))
+        for layer in self.narrow:
+            assert isinstance(layer, nn.Conv2d)
+            weight, bias = layer.weight.to(dtype), layer.bias
+            assert bias is not None  # as they are made
+            x = F.relu(F.conv2d(x, weight, bias.to(dtype), layer.stride, layer.padding))
+        if x.shape[2:] != (self.ROWS, COLUMNS):
+            x = F.adaptive_avg_pool2d(x, (self.ROWS, COLUMNS))
+        x = apply(self.out, F.relu(apply(self.read, x)))
+        return F.log_softmax(x.float().squeeze(2).transpose(1, 2), dim=-1)
+
+
+class SearchPolicy(Policy):
+    """The eyes of `search`: `look` says what a picture shows; a planner on a map decides.
+
+    It has no memory, actor or critic: `forward` is refused. `encoder` compares picture and goal,
+    `recogniser` reads the comparison, `ranges` sees the picture alone.
+    """
+
+    encoder: Matching
+
+    def _build(self, config: NetworkConfig) -> None:
+        pixels = config.pixel_mean, config.pixel_std
+        self.tracker = self.places = self.routes = self.around = None
+        self.encoder = Matching(config.size, config.channels, config.features, config.blocks,
+                                *pixels)
+        self.recogniser = Recogniser(config.features)
+        self.ranges = Ranges(*pixels)
+        self.heads = nn.ModuleDict()
+        self.target_side = self.cell = 0
+
+    def look(self, image: Tensor, goal_maps: Tensor, goal_index: Tensor | None = None) -> Look:
+        """What is seen.
+
+        Args:
+            image: [N,3,S,S] uint8.
+            goal_maps: of `encode_goals`.
+            goal_index: [N] int64, the goal of each picture; left out: goal n belongs to picture n.
+        """
+        _, features = self.encode(image, goal_maps, goal_index)
+        seen = self.recogniser(features)
+        return Look(self.ranges(image, self.compute_dtype), seen.position,
+                    PER_AXIS * seen.log_scale.exp(), seen.heading,
+                    heading_deviation(seen.log_concentration), seen.co_visible, seen.arrived)
+
+    def latents(self, obs: Observation, starts: Tensor, state: RecurrentState | None = None,
+                goal_maps: Tensor | None = None) -> tuple[Latents, RecurrentState]:
+        """There are none.
+
+        Raises:
+            UserError: always.
+        """
+        raise _no_actor()
+
+    def read(self, latents: Latents) -> PolicyOutput:
+        """There is no actor.
+
+        Raises:
+            UserError: always.
+        """
+        raise _no_actor()
+
+
+def heading_deviation(log_concentration: Tensor) -> Tensor:
+    """Circular standard deviation [rad] of von Mises distributions."""
+    kappa = log_concentration.exp()
+    return torch.sqrt(-2 * torch.log(torch.special.i1e(kappa) / torch.special.i0e(kappa)))
+
+
+def _no_actor() -> UserError:
+    return UserError('a policy of the architecture search decides by its map and planner',
+                     'its networks, asked for an action', 'use it in the runtime of '
+                     'vn_nav.policy.search')
