@@ -13,6 +13,7 @@ from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
+from vn_sim_bridge.datasets.view_ranges import ranges_of_depth, ray_cast
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import CELL, FloorMap
 from vn_sim_bridge.floor.places import FloorPlace, WalledPlace
@@ -29,6 +30,15 @@ CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
 # last angle is that of the robot's place off the line behind the goal. The rest stands anywhere.
 BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
 GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
+# The mixture `RECOGNITION` is for telling the goal from what is nearly it. Shares, the rest of one
+# of the three stands anywhere in the place; distances [m] and headings off the goal's [rad] are
+# drawn between two limits.
+MIXES = USUAL, RECOGNITION = 'usual', 'recognition'
+THERE = (0.15, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
+SEEN = 0.19  # and as `NEARBY` and `BEHIND`, in equal parts: a third in all
+BESIDE = (0.17, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
+ASKEW = (0.16, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew: a third in all
+TURNED = (0.17, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
 TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
 WINDOW = 12  # cells around a goal that a path of the arrival radius cannot leave
 
@@ -48,15 +58,22 @@ class PairSampler:
         randomisation: of light and camera; default: nothing varies.
         seed: of the draws.
         threads: threads that draw.
+        mix: of `MIXES`, how robots stand about goals: 'usual' as above, or 'recognition': a third
+            there or where the goal is likely seen, a third nearly there (`BESIDE`, `ASKEW`), a
+            third in the same room turned away (`TURNED`) or anywhere.
 
     Raises:
-        UserError: no scene, or a simulator that cannot look from anywhere.
+        UserError: no scene, an unknown mix, or a simulator that cannot look from anywhere.
     """
 
     def __init__(self, scenes: Sequence[str], size: int = 84, robot: RobotSpec | None = None,
-                 randomisation: Randomisation | None = None, seed: int = 0, threads: int = 1):
+                 randomisation: Randomisation | None = None, seed: int = 0, threads: int = 1,
+                 mix: str = USUAL):
         if len(scenes) < 1:
             raise UserError('there is at least one scene', scenes, 'name some')
+        if mix not in MIXES:
+            raise UserError(f'the mix of pairs is one of {", ".join(MIXES)}', mix, 'choose one')
+        self._place = _place if mix == USUAL else _place_to_recognise
         self.count = 0  # pairs drawn so far
         self._seed, self._size = seed, size
         self.robot = robot_for(scenes, robot)
@@ -119,13 +136,15 @@ class PairSampler:
             'place': place, 'pose': poses, 'goal_place': goal_poses,
         }
 
-    def draw_groups(self, count: int, robots: int = 3) -> dict[str, np.ndarray]:
+    def draw_groups(self, count: int, robots: int = 3, *, bearings: np.ndarray | None = None
+                    ) -> dict[str, np.ndarray]:
         """Views in groups, each of a goal and of several robots that stand about it as in a pair.
 
         Any two views of a group are a pair, either way round: more labels for each picture.
 
         Args:
             count: groups; robots: R in each.
+            bearings: [C] rad, positive to the left: asks for `ranges` along them, and `arrived`.
 
         Returns:
             image: [V,3,S,S] uint8 of V = count * (1 + R) views, a goal before its robots.
@@ -133,6 +152,8 @@ class PairSampler:
             first, second: [K] int64, views of the K = count * (1 + R) * R pairs; the second is
                 the goal.
             goal_pose: [K,4], overlap: [K], of the pairs, as `draw` returns them.
+            With bearings also arrived: [K] bool, of the pairs, and ranges: [V,C] float32 m from
+            the robot's centre to the first obstacle, `vn_sim_bridge.datasets.view_ranges`.
         """
         if count < 1 or robots < 1:
             raise UserError('a draw has at least one group, and that one robot', (count, robots),
@@ -153,12 +174,29 @@ class PairSampler:
         first, second = np.nonzero(~np.eye(size, dtype=bool))
         start = size * np.arange(count)[:, None]
         first, second = (start + first).reshape(-1), (start + second).reshape(-1)
-        return {
+        found = {
             'image': frames.rgb, 'depth': frames.depth, 'segmentation': frames.labels,
             'first': first, 'second': second,
             'goal_pose': relative_pose(poses[first], poses[second]),
             'overlap': co_visible(points[second], frames.depth[first], cameras[first], fov[first]),
         }
+        if bearings is not None:
+            where = np.repeat(place[::robots], size)
+            found |= {
+                'arrived': self.arrived(where[first], poses[first], poses[second]),
+                'ranges': self._ranges(where, poses, bearings, frames.depth, cameras, fov)}
+        return found
+
+    def _ranges(self, place: np.ndarray, poses: np.ndarray, bearings: np.ndarray,
+                depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray) -> np.ndarray:
+        """Of views, [V,C] float32: by the places' walls where they have some, else by depth."""
+        rects, first_rect = self._floors[2:4]
+        found = ray_cast(poses, place, np.asarray(bearings, float), rects, first_rect)
+        open_air = np.flatnonzero(first_rect[place] == first_rect[place + 1])
+        if len(open_air):
+            found[open_air] = ranges_of_depth(
+                depth[open_air], cameras[open_air], fov[open_air], poses[open_air, 2], bearings)
+        return found
 
     def poses(self, numbers: np.ndarray, robots: int = 1
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -171,7 +209,7 @@ class PairSampler:
         draws[:, 0], draws[:, 3:3 + 2 * TRIES] = draws[leader, 0], draws[leader, 3:3 + 2 * TRIES]
         place = (draws[:, 0] * len(self.places)).astype(np.int64)
         poses, goal_poses = np.zeros((2, len(numbers), 4))
-        _place(draws, place, *self._floors, poses, goal_poses)
+        self._place(draws, place, *self._floors, poses, goal_poses)
         if self._stands is not None:
             for k, index in enumerate(place):
                 for pose in (poses[k], goal_poses[k]):
@@ -268,6 +306,38 @@ def _fits(x, y, place, rects, first_rect, free, origins, radius):
 
 
 @numba.njit(cache=True)
+def _stand_goal(goal, rest, place, cells, low, count, rects, first_rect, free, origins):
+    """A goal [4] on a random cell, free straight ahead, by uniform numbers [2*TRIES]."""
+    for attempt in range(TRIES):
+        cell = low + int(rest[2 * attempt] * count)
+        goal[0], goal[1] = cells[cell, 0], cells[cell, 1]
+        goal[2] = (2 * rest[2 * attempt + 1] - 1) * math.pi
+        c, s = math.cos(goal[2]), math.sin(goal[2])
+        clear = True
+        for step in range(1, 6):
+            reach = GOAL_CLEARANCE * step / 5
+            if not _fits(goal[0] + c * reach, goal[1] + s * reach, place, rects, first_rect,
+                         free, origins, 0.0):
+                clear = False
+                break
+        if clear:
+            break
+
+
+@numba.njit(cache=True)
+def _stand_anywhere(pose, rest, place, cells, low, count, rects, first_rect, free, origins,
+                    radius):
+    """A robot [4], but for its heading, anywhere in its place, by uniform numbers [3*TRIES]."""
+    # Off the centre of its cell: robots stop anywhere.
+    for attempt in range(TRIES):
+        cell = low + int(rest[3 * attempt] * count)
+        pose[0] = cells[cell, 0] + (rest[3 * attempt + 1] - 0.5) * CELL
+        pose[1] = cells[cell, 1] + (rest[3 * attempt + 2] - 0.5) * CELL
+        if _fits(pose[0], pose[1], place, rects, first_rect, free, origins, radius):
+            break
+
+
+@numba.njit(cache=True)
 def _place(draws, places, cells, first_cell, rects, first_rect, free, origins, radius, poses,
            goal_poses):
     """Stand goals and robots up, by uniform numbers [K,3+5*TRIES]."""
@@ -276,32 +346,14 @@ def _place(draws, places, cells, first_cell, rects, first_rect, free, origins, r
         low, count = first_cell[place], first_cell[place + 1] - first_cell[place]
         rest = draws[k, 3:]
         goal = goal_poses[k]
-        for attempt in range(TRIES):
-            cell = low + int(rest[2 * attempt] * count)
-            goal[0], goal[1] = cells[cell, 0], cells[cell, 1]
-            goal[2] = (2 * rest[2 * attempt + 1] - 1) * math.pi
-            c, s = math.cos(goal[2]), math.sin(goal[2])
-            clear = True
-            for step in range(1, 6):
-                reach = GOAL_CLEARANCE * step / 5
-                if not _fits(goal[0] + c * reach, goal[1] + s * reach, place, rects, first_rect,
-                             free, origins, 0.0):
-                    clear = False
-                    break
-            if clear:
-                break
+        _stand_goal(goal, rest, place, cells, low, count, rects, first_rect, free, origins)
         rest = rest[2 * TRIES:]
         pose = poses[k]
         kind = draws[k, 1]
         behind = NEARBY[0] + CLOSE[0] <= kind < NEARBY[0] + CLOSE[0] + BEHIND[0]
         if kind >= NEARBY[0] + CLOSE[0] + BEHIND[0]:
-            # Off the centre of its cell: robots stop anywhere.
-            for attempt in range(TRIES):
-                cell = low + int(rest[3 * attempt] * count)
-                pose[0] = cells[cell, 0] + (rest[3 * attempt + 1] - 0.5) * CELL
-                pose[1] = cells[cell, 1] + (rest[3 * attempt + 2] - 0.5) * CELL
-                if _fits(pose[0], pose[1], place, rects, first_rect, free, origins, radius):
-                    break
+            _stand_anywhere(pose, rest, place, cells, low, count, rects, first_rect, free, origins,
+                            radius)
             pose[2] = (2 * draws[k, 2] - 1) * math.pi
             continue
         farthest, turn = BEHIND[1], BEHIND[2]
@@ -323,3 +375,49 @@ def _place(draws, places, cells, first_cell, rects, first_rect, free, origins, r
             yaw = math.atan2(goal[1] - pose[1], goal[0] - pose[0])
         yaw += (2 * draws[k, 2] - 1) * turn
         pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi
+
+
+@numba.njit(cache=True)
+def _place_to_recognise(draws, places, cells, first_cell, rects, first_rect, free, origins, radius,
+                        poses, goal_poses):
+    """As `_place`, in the mixture `RECOGNITION`."""
+    kinds = (THERE, BESIDE, ASKEW, TURNED)
+    usual = draws.copy()
+    for k in range(len(places)):
+        kind = draws[k, 1]
+        if kind < SEEN:  # `NEARBY` and `BEHIND` by the usual rules, half and half
+            within = kind / SEEN
+            usual[k, 1] = (2 * within * NEARBY[0] if within < 0.5 else
+                           NEARBY[0] + CLOSE[0] + (2 * within - 1) * BEHIND[0])
+        else:
+            usual[k, 1] = 1.0  # anywhere, unless one of the kinds below
+    _place(usual, places, cells, first_cell, rects, first_rect, free, origins, radius, poses,
+           goal_poses)
+    for k in range(len(places)):
+        begin = SEEN
+        for share, nearest, farthest, least, most in kinds:
+            if begin <= draws[k, 1] < begin + share:
+                _stand_about(poses[k], goal_poses[k], draws[k, 2], draws[k, 3 + 2 * TRIES:],
+                             nearest, farthest, least, most, places[k], rects, first_rect, free,
+                             origins, radius)
+            begin += share
+
+
+@numba.njit(cache=True)
+def _stand_about(pose, goal, turn, rest, nearest, farthest, least, most, place, rects, first_rect,
+                 free, origins, radius):
+    """A robot [4] between two distances from a goal [4], its heading off by two limits.
+
+    Where it fits nowhere it stays where it is.
+    """
+    for attempt in range(TRIES):
+        # As dense over the ring's area everywhere.
+        distance = math.sqrt(nearest**2 + (farthest**2 - nearest**2) * rest[3 * attempt])
+        angle = 2 * math.pi * rest[3 * attempt + 1]
+        x, y = goal[0] + distance * math.cos(angle), goal[1] + distance * math.sin(angle)
+        if _fits(x, y, place, rects, first_rect, free, origins, radius):
+            pose[0], pose[1] = x, y
+            off = (2 * turn - 1) * (most - least)
+            yaw = goal[2] + off + (least if off >= 0 else -least)
+            pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi
+            break
