@@ -32,7 +32,7 @@ from vn_nav.report.curves import average, read_runs
 
 CURVES = ROOT / 'docs' / 'curves' / 'simulators'
 CHART = ROOT / 'docs' / 'images' / 'learning.png'
-MINUTES, EPISODES = 20, 100
+MINUTES, EPISODES = 20, 50  # episodes of a row, at least
 HOUSE3D = ['--robot', 'config/robots/house3d.yaml']
 # Task: title, what is drawn, options of the training, of the training and the evaluation.
 TASKS = {

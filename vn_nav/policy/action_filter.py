@@ -83,7 +83,7 @@ class BlockedActionFilter:
             last_action: [N] int64; -1: none, or none of these.
             starts: [N] bool, where an episode begins: nothing is remembered.
         """
-        small = _thumbnails(pictures)
+        small = thumbnails(pictures)
         still = abs(small - self._before).mean(1) < UNCHANGED_GREY_LEVELS
         self._before = small
         done = (last_action[:, None] == self._actions) & ~starts[:, None]  # [N,A]
@@ -128,7 +128,7 @@ class BlockedActionFilter:
         return (heading * (HEADINGS / (2 * math.pi))).round() % HEADINGS
 
 
-def _thumbnails(pictures: Array) -> Array:
+def thumbnails(pictures: Array) -> Array:
     """Means [N,192] float32 over 8 x 8 windows of pictures [N,3,S,S]."""
     if not isinstance(pictures, np.ndarray):
         from torch.nn import functional as F

@@ -1,0 +1,221 @@
+"""The map of the policy `search`, ways on it, and hypotheses of where the goal is."""
+
+import math
+
+import numpy as np
+import pytest
+
+from vn_nav.policy.search.grid import CELL, SIDE, Grid
+from vn_nav.policy.search.hypotheses import Hypotheses, apart, on_map
+from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, column_bearings
+from vn_nav.policy.search.searcher import Searcher, Sight
+from vn_nav.policy.search.ways import Ways
+
+BEARINGS = column_bearings(math.pi / 2)
+MOVES = ((0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, math.pi / 6), (0.0, 0.0, -math.pi / 6))
+FORWARD, BACKWARD, LEFT, RIGHT = range(4)
+
+
+def one_hot(ranges):
+    """Distributions [C,B] that are sure of ranges [C] m."""
+    return np.eye(BINS)[np.searchsorted(RANGE_EDGES, ranges)]
+
+
+def wall_ahead(distance):
+    """Ranges [C] to a wall across the robot's way."""
+    return distance / np.cos(BEARINGS)
+
+
+def room(pose, half=2.0):
+    """Ranges [C] in a square room about the origin, seen from a pose [3]."""
+    angles = pose[2] + BEARINGS
+    with np.errstate(divide='ignore'):
+        x = (np.sign(np.cos(angles)) * half - pose[0]) / np.cos(angles)
+        y = (np.sign(np.sin(angles)) * half - pose[1]) / np.sin(angles)
+    return np.minimum(np.abs(x), np.abs(y))
+
+
+def looked_around(grid=None, place=(0.0, 0.0)):
+    """A grid that knows the room."""
+    grid = grid or Grid(0.25)
+    for yaw in np.arange(12) * math.pi / 6:
+        pose = np.array([*place, yaw])
+        grid.stand(pose)
+        grid.add_ranges(pose, BEARINGS, one_hot(room(pose)), RANGE_EDGES)
+    return grid
+
+
+def sight(**changes):
+    return Sight(**{'ranges': one_hot(np.full(COLUMNS, 3.0)), 'position': np.array([1.0, 0.0]),
+                    'sigma': 0.3, 'heading': np.array([1.0, 0.0]), 'co_visible': 0.05,
+                    'arrived': 0.01, **changes})
+
+
+def test_a_wall_is_occupied_before_it_is_free_and_behind_it_is_unknown():
+    grid = Grid(0.25)
+    for _ in range(3):
+        grid.add_ranges(np.zeros(3), BEARINGS, one_hot(wall_ahead(2.0)), RANGE_EDGES)
+    row, _ = grid.cell(0.0, 0.0)
+    for x in (0.3, 1.0, 1.5):
+        assert grid.log_odds[grid.cell(x, 0.0)] < -1 and not grid.unknown()[grid.cell(x, 0.0)]
+    at = [grid.cell(x, 0.0) for x in np.arange(1.7, 2.4, CELL)]
+    assert any(grid.obstacles()[cell] for cell in at)
+    assert grid.unknown()[grid.cell(3.0, 0.0)] and grid.unknown()[grid.cell(-1.0, 0.0)]
+    assert not grid.obstacles()[row, :grid.cell(1.5, 0.0)[1]].any()
+
+
+def test_a_doubtful_range_marks_nothing_as_an_obstacle():
+    grid = Grid(0.25)
+    grid.add_ranges(np.zeros(3), BEARINGS, np.full((COLUMNS, BINS), 1 / BINS), RANGE_EDGES)
+    assert not grid.obstacles().any()
+
+
+def test_where_the_robot_stood_is_free_and_where_it_was_stopped_is_not():
+    grid = Grid(0.25)
+    grid.touch(np.zeros(3), 0.0)
+    assert grid.obstacles()[grid.cell(0.3, 0.0)]
+    for _ in range(3):  # no look clears a contact
+        grid.add_ranges(np.zeros(3), BEARINGS, one_hot(wall_ahead(3.0)), RANGE_EDGES)
+    assert grid.obstacles()[grid.cell(0.3, 0.0)]
+    grid.stand(np.array([0.3, 0.0, 0.0]))  # but standing there does
+    assert not grid.obstacles()[grid.cell(0.3, 0.0)]
+
+
+def test_the_map_moves_along_with_the_robot():
+    grid = Grid(0.25)
+    grid.add_ranges(np.zeros(3), BEARINGS, one_hot(wall_ahead(2.0)), RANGE_EDGES)
+    before = grid.log_odds[grid.cell(1.0, 0.0)]
+    grid.stand(np.array([11.0, 0.0, 0.0]))
+    assert grid.origin[0] > -CELL * SIDE / 2
+    assert grid.log_odds[grid.cell(1.0, 0.0)] == before < 0
+    grid.stand(np.array([40.0, 0.0, 0.0]))  # farther than its side: all is forgotten
+    assert not grid.log_odds.any()
+
+
+def test_ways_keep_the_footprint_off_obstacles_and_go_round_them():
+    grid = looked_around()
+    ways = Ways(grid)
+    assert ways.passable[grid.cell(0.0, 0.0)] and not ways.passable[grid.cell(1.9, 0.0)]
+    goal = np.array([grid.cell(1.0, 0.0)])
+    here = grid.cell(-1.0, 0.0)
+    straight = ways.to(goal, np.zeros(1), here, through_unknown=False)[here]
+    assert straight == pytest.approx(2.0, abs=0.15)
+    for y in np.arange(-0.6, 0.61, CELL):  # a wall of contacts across the way
+        grid.touch(np.array([-0.3, y, 0.0]), 0.0)
+    ways = Ways(grid)
+    around = ways.to(goal, np.zeros(1), here, through_unknown=False)[here]
+    assert straight + 0.5 < around < straight + 3.0
+    got, _ = ways.cut(-1.0, 0.0, 0.0, 1.5)
+    assert got < 1.0 and ways.cut(-1.0, 0.0, math.pi / 2, 0.5)[0] == 0.5
+
+
+def test_an_opening_in_the_wall_is_a_frontier_and_a_whole_room_has_none():
+    assert len(Ways(looked_around()).frontiers()[0]) == 0
+    grid = Grid(0.25)
+    for yaw in np.arange(12) * math.pi / 6:
+        pose = np.array([0.0, 0.0, yaw])
+        ranges = room(pose)
+        open_door = np.abs(np.sin(yaw + BEARINGS)) < 0.35
+        ranges[open_door & (np.cos(yaw + BEARINGS) > 0)] = 7.0
+        grid.stand(pose)
+        grid.add_ranges(pose, BEARINGS, one_hot(ranges), RANGE_EDGES)
+    cells, head_start = Ways(grid).frontiers()
+    x = grid.origin[0] + (cells[:, 1] + 0.5) * CELL
+    assert len(cells) and (x > 1.5).all() and (head_start > 0).all()
+
+
+def test_what_looks_never_show_is_no_more_looked_for():
+    grid = looked_around()
+    row, column = grid.cell(1.0, 1.0)
+    hole = slice(row - 1, row + 2), slice(column - 1, column + 2)
+    grid.seen[hole] = 0  # no picture fills it
+    assert grid.look_gains(0.0, 0.0, np.array([math.pi / 4]), BEARINGS)[0] > 0
+    grid.missed[hole] = 3
+    assert grid.look_gains(0.0, 0.0, np.array([math.pi / 4]), BEARINGS)[0] == 0
+    assert not grid.unknown()[grid.cell(1.0, 1.0)]
+    grid.forget_looks()
+    assert grid.unknown()[grid.cell(1.0, 1.0)] and grid.obstacles().any()
+
+
+def test_votes_merge_near_ones_count_more_and_misses_refute():
+    own = Hypotheses()
+    far = np.array([4.5, 0.5]), 1.2
+    own.look(np.zeros(3), far[0], far[1], np.array([1.0, 0.0]), 0.9)
+    near_pose = np.array([3.0, 0.0, 0.0])
+    own.look(near_pose, np.array([1.0, 0.0]), 0.2, np.array([1.0, 0.0]), 0.95)
+    assert len(own.all) == 1
+    assert np.hypot(*(own.best().pose[:2] - (4.0, 0.0))) < 0.15  # the near look has the say
+    weight = own.best().weight
+    own.look(np.array([3.5, 0.0, 0.0]), np.zeros(2), 1.0, np.array([1.0, 0.0]), 0.05)
+    assert own.best().weight == weight / 2 and own.best().refuted == 1
+    own.look(np.zeros(3), np.array([-3.0, 0.0]), 0.5, np.array([-1.0, 0.0]), 0.99)
+    assert len(own.all) == 2
+    for _ in range(12):
+        own.look(near_pose + [0.6, 0, 0], np.zeros(2), 1.0, np.array([1.0, 0.0]), 0.05)
+    assert len(own.all) == 1 and own.best().pose[0] == pytest.approx(-3.0)
+
+
+def test_a_look_is_put_on_the_map_by_the_robots_pose():
+    pose = on_map(np.array([1.0, 2.0, math.pi / 2]), np.array([2.0, 0.5]), np.array([0.0, 1.0]))
+    np.testing.assert_allclose(pose[:2], [0.5, 4.0])
+    assert apart(pose, np.array([0.5, 4.0, math.pi]))[1] < 1e-9
+
+
+def searcher():
+    return Searcher(MOVES, BEARINGS, RANGE_EDGES, 0.25)
+
+
+def test_it_drives_to_what_it_recognises_turns_and_then_gives_the_place_up():
+    own = searcher()
+    pose, actions = np.zeros(3), []
+    goal = np.array([1.5, 0.0, math.pi / 2])
+    for step in range(12):
+        gap = goal[:2] - pose[:2]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        turn = goal[2] - pose[2]
+        action = own.step(sight(
+            ranges=one_hot(room(pose)), position=np.array([c * gap[0] + s * gap[1],
+                                                           c * gap[1] - s * gap[0]]),
+            heading=np.array([math.cos(turn), math.sin(turn)]), co_visible=0.97),
+            actions[-1] if actions else -1, pose)
+        actions.append(action)
+        move = MOVES[action]
+        pose = pose + [c * move[0], s * move[0], move[2]]
+        if apart(pose, goal)[0] < 0.4 and apart(pose, goal)[1] < 0.3:
+            break
+    assert step < 8 and own.aim == 'turn'
+
+
+def test_without_odometry_it_counts_on_its_moves_and_sees_that_it_stood_still():
+    own = searcher()
+    own.step(sight(), -1, None)
+    own.step(sight(), FORWARD, None)
+    np.testing.assert_allclose(own.pose, [0.5, 0.0, 0.0])
+    own.step(sight(), LEFT, None)
+    own.step(sight(), FORWARD, None, unmoved=True)
+    np.testing.assert_allclose(own.pose, [0.5, 0.0, math.pi / 6])
+    assert own.grid.touched.any()
+
+
+def test_a_move_that_met_something_is_not_tried_again_there():
+    own = searcher()
+    last, odometry = -1, np.zeros(3)
+    for _ in range(40):
+        ranges = np.full(COLUMNS, 6.0)  # the pictures say that all is free, and nothing moves
+        last = own.step(sight(ranges=one_hot(ranges)), last, odometry)
+        if last in (LEFT, RIGHT):
+            odometry = odometry + [0, 0, MOVES[last][2]]
+    directions = [round(own[2] / (math.pi / 6)) % 12 for own in own._blocked]
+    assert len(directions) == len(set(directions)) <= 12
+
+
+def test_the_same_looks_make_the_same_decisions():
+    def drive():
+        own, rng = searcher(), np.random.default_rng(3)
+        last, actions = -1, []
+        for _ in range(20):
+            ranges = one_hot(rng.uniform(0.5, 6.0, COLUMNS))
+            last = own.step(sight(ranges=ranges, co_visible=rng.uniform()), last, None)
+            actions.append(last)
+        return actions
+    assert drive() == drive()

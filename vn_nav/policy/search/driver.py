@@ -1,0 +1,78 @@
+"""Drives robots by a `SearchPolicy`: its networks see, a `Searcher` for each robot decides."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
+from vn_nav.policy.search.look import RANGE_EDGES, Look, column_bearings
+from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.searcher import Rules, Searcher, Sight
+
+
+class SearchDriver:
+    """Of N robots.
+
+    Args:
+        network: what sees.
+        num_envs: robots, N.
+        rules: of the decisions; None: the usual ones.
+
+    Attributes:
+        searchers: [N], with map and hypotheses of each robot.
+        arrival: [N] float32 probability that the robots have arrived, at the newest pictures.
+    """
+
+    def __init__(self, network: SearchPolicy, num_envs: int, rules: Rules | None = None):
+        config = network.config
+        self.network = network
+        bearings = column_bearings(config.view)
+        self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint, rules)
+                          for _ in range(num_envs)]
+        self.arrival = np.full(num_envs, np.nan, np.float32)
+        self._before: np.ndarray | None = None
+
+    @torch.inference_mode()
+    def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
+            starts: np.ndarray, odometry: np.ndarray | None) -> np.ndarray:
+        """Actions [N] int64.
+
+        Args:
+            image: [N,3,S,S] uint8.
+            goal_maps: [N,...], of each robot's goal.
+            last_action: [N], -1: none.
+            starts: [N] bool, where an episode begins: map and hypotheses are empty.
+            odometry: [N,3] x, y [m], yaw [rad]; None: nobody has any.
+
+        Raises:
+            FloatingPointError: what the networks say is not finite.
+        """
+        look = self.network.look(torch.from_numpy(image), goal_maps)
+        if not all(torch.isfinite(part).all() for part in look):
+            raise FloatingPointError('what the policy sees is not finite')
+        sights = sights_of(look)
+        small = thumbnails(image)
+        still = (np.zeros(len(image), bool) if self._before is None
+                 else np.abs(small - self._before).mean(1) < UNCHANGED_GREY_LEVELS)
+        self._before = small
+        actions = np.empty(len(image), np.int64)
+        for n, (searcher, sight) in enumerate(zip(self.searchers, sights, strict=True)):
+            if starts[n]:
+                searcher.reset()
+            actions[n] = searcher.step(sight, -1 if starts[n] else int(last_action[n]),
+                                       None if odometry is None else odometry[n],
+                                       unmoved=bool(still[n]) and not starts[n])
+            self.arrival[n] = searcher.arrival
+        return actions
+
+
+def sights_of(look: Look) -> list[Sight]:
+    """What is seen of each picture, as probabilities in NumPy's memory."""
+    ranges = look.ranges.exp().numpy()
+    position, sigma = look.position.numpy(), look.position_sigma.numpy()
+    heading = look.heading.numpy()
+    co_visible, arrived = (torch.sigmoid(part).numpy() for part in (look.co_visible, look.arrived))
+    return [Sight(ranges[n], position[n], float(sigma[n]), heading[n], float(co_visible[n]),
+                  float(arrived[n])) for n in range(len(ranges))]

@@ -1,0 +1,229 @@
+"""What a robot has seen of the floor: an occupancy map about its start, built look by look.
+
+Cells of `CELL` metres hold log-odds of an obstacle and how often they were seen. The map lies in
+the frame of the odometry that poses are given in; where the robot comes near its edge, it moves
+along. Kernels run in NumPy's memory, compiled; torch is not needed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+CELL = 0.1  # m
+SIDE = 320  # cells
+MARGIN = 60  # cells from the edge at which the map is moved
+REACH = 5.0  # m: ranges beyond tell nothing about cells
+SUB_RAYS = 3  # a column of the picture
+FREE_WEIGHT, HIT_WEIGHT = 0.9, 3.0  # log-odds of a ray that passes, and of one that ends here
+MOST = 4.0  # log-odds either way
+POINT = 0.75 * CELL  # m: a disc of this radius has a cell's centre in it wherever it lies
+OCCUPIED = 0.5  # log-odds from which a cell is an obstacle
+KNOWN = 0.6  # looks from which a cell is not unknown any more
+MISSES = 3  # looks that should have shown a cell by the map, and did not: it is none to look for
+VIEW = 2.5  # m to which a look is expected to show floor
+
+
+class Grid:
+    """The map of one robot.
+
+    Args:
+        footprint: radius of the robot [m].
+
+    Attributes:
+        log_odds: [SIDE,SIDE] float32, rows along y.
+        seen: [SIDE,SIDE] float32: looks that passed or ended here, in expectation.
+        missed: [SIDE,SIDE] int16: looks that should have shown it, by the map, and did not.
+        stood: [SIDE,SIDE] bool: the robot was on it; been: its centre was.
+        touched: [SIDE,SIDE] bool: it met something here.
+        origin: [2] m, of the lower left corner.
+    """
+
+    def __init__(self, footprint: float):
+        self.footprint = footprint
+        self.log_odds = np.zeros((SIDE, SIDE), np.float32)
+        self.seen = np.zeros((SIDE, SIDE), np.float32)
+        self.missed = np.zeros((SIDE, SIDE), np.int16)
+        self.stood = np.zeros((SIDE, SIDE), bool)
+        self.been = np.zeros((SIDE, SIDE), bool)
+        self.touched = np.zeros((SIDE, SIDE), bool)
+        self.origin = np.array([-CELL * SIDE / 2, -CELL * SIDE / 2])
+
+    def add_ranges(self, pose: np.ndarray, bearings: np.ndarray, ranges: np.ndarray,
+                   edges: np.ndarray) -> None:
+        """Enter what a picture says.
+
+        Args:
+            pose: [3] x, y [m], yaw [rad] of the camera's robot.
+            bearings: [C] rad of the columns, positive to the left.
+            ranges: [C,B] probabilities of the first obstacle's range.
+            edges: [B-1] m between the bins; the first bin is nearer than the first edge, the last
+                one farther than the last.
+        """
+        self._follow(pose)
+        spread = np.abs(np.gradient(bearings)).mean()
+        _integrate(self.log_odds, self.seen, self.origin, np.asarray(pose, float),
+                   np.asarray(bearings, float), float(spread), np.asarray(ranges, float),
+                   np.asarray(edges, float))
+        _expect(self.unknown(), self.obstacles(), self.missed, self.origin, pose[0], pose[1],
+                pose[2] + np.asarray(bearings, float), True)
+
+    def look_gains(self, x: float, y: float, headings: np.ndarray, bearings: np.ndarray
+                   ) -> np.ndarray:
+        """Unknown floor [K] m^2 that looks from a place would show, by the map.
+
+        Args:
+            x, y: m.
+            headings: [K] rad.
+            bearings: [C] rad of the picture's columns.
+        """
+        unknown, obstacles = self.unknown(), self.obstacles()
+        return np.array([_expect(unknown, obstacles, self.missed, self.origin, x, y,
+                                 heading + bearings, False) for heading in headings])
+
+    def forget_looks(self) -> None:
+        """Let everything be looked at again; obstacles and free floor stay."""
+        self.seen *= 0.2
+        self.missed[:] = 0
+
+    def stand(self, pose: np.ndarray) -> None:
+        """Enter that the robot stands here: its footprint is free."""
+        self._follow(pose)
+        _disc(self.stood, self.origin, pose[0], pose[1], self.footprint, True)
+        _disc(self.been, self.origin, pose[0], pose[1], POINT, True)
+        _disc(self.touched, self.origin, pose[0], pose[1], self.footprint - CELL, False)
+
+    def touch(self, pose: np.ndarray, direction: float) -> None:
+        """Enter a contact: something is at the rim of the robot in a direction [rad]."""
+        for off in (-0.35, 0.0, 0.35):
+            reach = self.footprint + 0.5 * CELL
+            x = pose[0] + reach * math.cos(direction + off)
+            y = pose[1] + reach * math.sin(direction + off)
+            _disc(self.touched, self.origin, x, y, POINT, True)
+
+    def obstacles(self) -> np.ndarray:
+        """[SIDE,SIDE] bool."""
+        return ((self.log_odds > OCCUPIED) & ~self.stood) | self.touched
+
+    def unknown(self) -> np.ndarray:
+        """[SIDE,SIDE] bool: hardly seen."""
+        return (self.seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.touched
+
+    def cell(self, x: float, y: float) -> tuple[int, int]:
+        """Row and column of a place; outside, of the nearest cell."""
+        column, row = ((np.array([x, y]) - self.origin) / CELL).astype(int)
+        return int(np.clip(row, 0, SIDE - 1)), int(np.clip(column, 0, SIDE - 1))
+
+    def _follow(self, pose: np.ndarray) -> None:
+        """Move the map where the robot comes near its edge; what falls off is forgotten."""
+        column, row = np.floor((np.asarray(pose[:2]) - self.origin) / CELL).astype(int)
+        if MARGIN <= row < SIDE - MARGIN and MARGIN <= column < SIDE - MARGIN:
+            return
+        shift = np.array([column, row]) - SIDE // 2
+        for name in ('log_odds', 'seen', 'missed', 'stood', 'been', 'touched'):
+            old = getattr(self, name)
+            new = np.zeros_like(old)
+            rows, columns = (np.arange(SIDE) + s for s in shift[::-1])
+            inside = np.ix_((rows >= 0) & (rows < SIDE), (columns >= 0) & (columns < SIDE))
+            new[inside] = old[np.ix_(rows[(rows >= 0) & (rows < SIDE)],
+                                     columns[(columns >= 0) & (columns < SIDE)])]
+            setattr(self, name, new)
+        self.origin = self.origin + CELL * shift
+
+
+@numba.njit(cache=True)
+def _integrate(log_odds, seen, origin, pose, bearings, spread, ranges, edges):
+    """Each cell gets the mean of the rays that pass it: a look counts once, near or far."""
+    side = log_odds.shape[0]
+    step = 0.5 * CELL
+    count = int(REACH / step)
+    first = np.zeros((side, side), np.float32)
+    passed = np.zeros((side, side), np.float32)
+    times = np.zeros((side, side), np.int32)
+    bins = ranges.shape[1]
+    low_row, high_row, low_column, high_column = side, -1, side, -1
+    for c in range(len(bearings)):
+        # Probability that the way is free up to each edge, and beyond.
+        beyond = np.empty(bins)  # at the bin's far edge
+        left = 1.0
+        for b in range(bins):
+            left -= ranges[c, b]
+            beyond[b] = max(left, 0.0)
+        for sub in range(SUB_RAYS):
+            angle = pose[2] + bearings[c] + spread * ((sub + 0.5) / SUB_RAYS - 0.5)
+            dx, dy = math.cos(angle), math.sin(angle)
+            for k in range(count):
+                r = (k + 0.5) * step
+                here = _free_up_to(r - 0.5 * step, beyond, edges)
+                after = _free_up_to(r + 0.5 * step, beyond, edges)
+                if here < 0.02:
+                    break
+                column = int(math.floor((pose[0] + r * dx - origin[0]) / CELL))
+                row = int(math.floor((pose[1] + r * dy - origin[1]) / CELL))
+                if row < 0 or row >= side or column < 0 or column >= side:
+                    break
+                # A hit's thickness is a cell: two steps of the ray.
+                first[row, column] += HIT_WEIGHT * 2 * (here - after) - FREE_WEIGHT * after
+                passed[row, column] += here
+                times[row, column] += 1
+                low_row, high_row = min(low_row, row), max(high_row, row)
+                low_column, high_column = min(low_column, column), max(high_column, column)
+    for row in range(low_row, high_row + 1):
+        for column in range(low_column, high_column + 1):
+            n = times[row, column]
+            if n:
+                value = log_odds[row, column] + first[row, column] / n
+                log_odds[row, column] = min(max(value, -MOST), MOST)
+                seen[row, column] += passed[row, column] / n
+
+
+@numba.njit(cache=True)
+def _free_up_to(r, beyond, edges):
+    """Probability that the first obstacle is farther than r, linear within a bin."""
+    if r <= 0.0:
+        return 1.0
+    near, before = 0.0, 1.0
+    for b in range(len(edges)):
+        if r <= edges[b]:
+            return before + (beyond[b] - before) * (r - near) / (edges[b] - near)
+        near, before = edges[b], beyond[b]
+    return before
+
+
+@numba.njit(cache=True)
+def _disc(layer, origin, x, y, radius, value):
+    """Set the cells whose centres lie within a radius."""
+    side = layer.shape[0]
+    reach = int(math.ceil(radius / CELL))
+    column, row = int(math.floor((x - origin[0]) / CELL)), int(math.floor((y - origin[1]) / CELL))
+    for i in range(max(row - reach, 0), min(row + reach + 1, side)):
+        for j in range(max(column - reach, 0), min(column + reach + 1, side)):
+            dx, dy = origin[0] + (j + 0.5) * CELL - x, origin[1] + (i + 0.5) * CELL - y
+            if dx * dx + dy * dy <= radius * radius:
+                layer[i, j] = value
+
+
+@numba.njit(cache=True)
+def _expect(unknown, obstacles, missed, origin, x, y, angles, count):
+    """Area of unknown cells [m^2] in view by the map; with `count` each is missed once more."""
+    side = unknown.shape[0]
+    spread = abs(angles[-1] - angles[0]) / max(len(angles) - 1, 1)
+    done = np.zeros((side, side), np.bool_)
+    area = 0.0
+    for angle in angles:
+        dx, dy = math.cos(angle), math.sin(angle)
+        for k in range(3, int(VIEW / CELL)):
+            r = (k + 0.5) * CELL
+            column = int(math.floor((x + r * dx - origin[0]) / CELL))
+            row = int(math.floor((y + r * dy - origin[1]) / CELL))
+            if (row < 0 or column < 0 or row >= side or column >= side
+                    or obstacles[row, column]):
+                break
+            if unknown[row, column]:
+                area += r * spread * CELL
+                if count and not done[row, column]:
+                    done[row, column] = True
+                    missed[row, column] += 1
+    return area

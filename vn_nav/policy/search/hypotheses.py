@@ -1,0 +1,101 @@
+"""Where the goal may be on the map: looks vote for poses, near ones refine, misses refute."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from vn_nav.arrival import wrap_angle
+
+VOTES_FROM = 0.6  # co-visibility of a look that votes
+MERGE_M, MERGE_RAD = 1.2, math.radians(50)  # votes so near each other are for one place
+ODDS_MOST = 20.0  # a look's
+NEAR = 0.7  # m: from here on a look is worth no more for being nearer
+MISS_M, MISS_RAD = 1.3, math.radians(35)  # seen from so near, the goal would be recognised
+MISS_BELOW = 0.35  # co-visibility that refutes there
+WEIGHT_MOST = 200.0
+FORGET = 0.1  # weight under which a hypothesis is dropped
+
+
+@dataclasses.dataclass
+class Hypothesis:
+    """A pose that the goal may have.
+
+    Attributes:
+        pose: [3] x, y [m], yaw [rad] on the map.
+        weight: evidence: sum of odds over distance.
+        precision: of the position [1/m^2], of the votes together.
+        refuted: how often it was seen near and not recognised, or stood at in vain.
+    """
+
+    pose: np.ndarray
+    weight: float
+    precision: float
+    refuted: int = 0
+
+
+def on_map(pose: np.ndarray, position: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """The goal's pose [3], seen from a robot's pose [3] at a position [2] with a heading [2]."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array([pose[0] + c * position[0] - s * position[1],
+                     pose[1] + s * position[0] + c * position[1],
+                     wrap_angle(pose[2] + math.atan2(heading[1], heading[0]))])
+
+
+class Hypotheses:
+    """All poses that the goal may have, for one robot."""
+
+    def __init__(self):
+        self.all: list[Hypothesis] = []
+
+    def look(self, pose: np.ndarray, position: np.ndarray, sigma: float, heading: np.ndarray,
+             co_visible: float) -> None:
+        """Take in what one picture says.
+
+        Args:
+            pose: [3] of the robot on the map.
+            position, heading: [2] of the goal in the robot's frame; sigma: m of the position.
+            co_visible: probability that the picture shows some of what the goal shows.
+        """
+        for own in self.all:
+            gap, turn = apart(pose, own.pose)
+            if gap < MISS_M and turn < MISS_RAD and co_visible < MISS_BELOW:
+                own.weight *= 0.5
+                own.refuted += 1
+        if co_visible > VOTES_FROM:
+            odds = min(co_visible / max(1 - co_visible, 1e-6), ODDS_MOST)
+            far = float(np.hypot(*position))
+            self._vote(on_map(pose, position, heading), odds / max(far, NEAR),
+                       co_visible / max(sigma, 0.15) ** 2)
+        self.all = [own for own in self.all if own.weight > FORGET]
+
+    def refute(self, own: Hypothesis) -> None:
+        """The robot stood there, and it was not the goal."""
+        own.refuted += 1
+        own.weight *= 0.25
+
+    def best(self) -> Hypothesis | None:
+        """The one with most evidence."""
+        return max(self.all, key=lambda own: own.weight, default=None)
+
+    def _vote(self, pose: np.ndarray, weight: float, precision: float) -> None:
+        near = [own for own in self.all
+                if apart(own.pose, pose)[0] < MERGE_M and apart(own.pose, pose)[1] < MERGE_RAD]
+        if not near:
+            self.all.append(Hypothesis(pose, weight, precision))
+            return
+        own = max(near, key=lambda own: own.weight)
+        # The newest look counts at least a fifth: odometry drifts, and near looks are better.
+        gain = max(precision / (own.precision + precision), 0.2)
+        own.pose[:2] += gain * (pose[:2] - own.pose[:2])
+        own.pose[2] = wrap_angle(own.pose[2] + gain * wrap_angle(pose[2] - own.pose[2]))
+        own.precision = min(own.precision + precision, 400.0)
+        own.weight = min(own.weight + weight, WEIGHT_MOST)
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Distance [m] and difference of the headings [rad] of two poses [3]."""
+    return (float(np.hypot(*(one[:2] - other[:2]))),
+            abs(wrap_angle(float(one[2] - other[2]))))

@@ -1,0 +1,256 @@
+"""Searches a place for a goal: looks, maps, follows hypotheses of where it is, else explores.
+
+One robot. Nothing here is learned: networks say what a picture shows (`look.Look`), this decides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from vn_nav.arrival import wrap_angle
+from vn_nav.policy.search.grid import Grid
+from vn_nav.policy.search.hypotheses import Hypotheses, Hypothesis, apart
+from vn_nav.policy.search.ways import Ways
+
+BLOCKED_M, BLOCKED_RAD = 0.2, math.radians(20)  # a contact is remembered about its place
+
+
+@dataclasses.dataclass(frozen=True)
+class Rules:
+    """Numbers of the decisions, fitted on training houses."""
+
+    follow_from: float = 2.0  # evidence of a hypothesis that the robot drives to
+    reached_m: float = 0.4  # so near a hypothesis it turns to its heading
+    reached_rad: float = math.radians(18)
+    turn_cost: float = 0.05  # m that a turn is worth
+    look_cost: float = 0.12  # m that a turn to look is worth
+    look_worth: float = 0.6  # m that a square metre of unknown floor in view is worth
+    look_most: float = 1.5  # m
+    look_from: float = 0.4  # m^2 in view that make a look
+    contact_cost: float = 4.0  # for each metre that an obstacle would cut off
+    graze_cost: float = 0.6  # m for passing an obstacle at the footprint, none from `graze_m` on
+    graze_m: float = 0.2
+    backward_cost: float = 0.3  # m
+    back_cost: float = 0.3  # m for turning back where the robot has just turned from
+
+
+@dataclasses.dataclass
+class Sight:
+    """What the networks say of one picture, as probabilities."""
+
+    ranges: np.ndarray  # [C,B]
+    position: np.ndarray  # [2] m, of the goal in the robot's frame
+    sigma: float  # m
+    heading: np.ndarray  # [2] cos, sin
+    co_visible: float
+    arrived: float
+
+
+class Searcher:
+    """One robot's search for one goal.
+
+    Args:
+        moves: [A][3] dx, dy [m], dyaw [rad] of the actions.
+        bearings: [C] rad of the columns of the ranges; edges: [B-1] m of their bins.
+        footprint: radius of the robot [m].
+        rules: numbers of the decisions.
+
+    Attributes:
+        pose: [3] x, y [m], yaw [rad] on the map.
+        grid, hypotheses: what it knows.
+        arrival: probability that the robot has arrived, by the newest picture.
+        aim: in a word, what it was about: 'follow', 'turn', 'explore', 'look' or 'lost'.
+    """
+
+    def __init__(self, moves: Sequence[Sequence[float]], bearings: np.ndarray, edges: np.ndarray,
+                 footprint: float, rules: Rules | None = None):
+        self.moves = np.array(moves, float)
+        self.bearings, self.edges, self.footprint = bearings, edges, footprint
+        self.rules = rules or Rules()
+        still = np.hypot(self.moves[:, 0], self.moves[:, 1]) < 1e-6
+        self._left = int(np.argmax(np.where(still, self.moves[:, 2], -np.inf)))
+        self._right = int(np.argmin(np.where(still, self.moves[:, 2], np.inf)))
+        self._turn = float(self.moves[self._left, 2])
+        self._drives = np.flatnonzero(~still)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a search: an empty map about the robot."""
+        self.grid = Grid(self.footprint)
+        self.hypotheses = Hypotheses()
+        self.pose = np.zeros(3)
+        self.aim, self.arrival = 'look', 0.0
+        self._last = -1
+        self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
+
+    def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
+             unmoved: bool = False) -> int:
+        """The next action.
+
+        Args:
+            sight: of the newest picture.
+            last_action: what was done before it; -1: nothing.
+            odometry: [3] pose, if the robot has odometry; its frame becomes the map's.
+            unmoved: without odometry: the picture is as before the action.
+        """
+        self._move(last_action, odometry, unmoved)
+        self.grid.stand(self.pose)
+        self.grid.add_ranges(self.pose, self.bearings, sight.ranges, self.edges)
+        self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
+                             sight.co_visible)
+        self.arrival = sight.arrived
+        action = self._decide()
+        self._last = action
+        return action
+
+    def _move(self, action: int, odometry: np.ndarray | None, unmoved: bool) -> None:
+        """Follow the robot on the map, and enter what stopped it."""
+        before = self.pose
+        move = self.moves[action] if action >= 0 else np.zeros(3)
+        if odometry is not None:
+            self.pose = np.array(odometry, float)
+        elif not (unmoved and np.hypot(*move[:2]) > 0):
+            c, s = math.cos(before[2]), math.sin(before[2])
+            self.pose = np.array([before[0] + c * move[0] - s * move[1],
+                                  before[1] + s * move[0] + c * move[1],
+                                  wrap_angle(before[2] + move[2])])
+        wanted = float(np.hypot(*move[:2]))
+        if wanted > 0:
+            done = float(np.hypot(*(self.pose - before)[:2]))
+            if done < 0.75 * wanted:
+                direction = before[2] + math.atan2(move[1], move[0])
+                self.grid.touch(self.pose, direction)
+                self._blocked.append(np.array([*self.pose[:2], direction]))
+
+    def _decide(self) -> int:
+        ways = Ways(self.grid)
+        here = self.grid.cell(*self.pose[:2])
+        for own in sorted(self.hypotheses.all, key=lambda own: -own.weight):
+            if own.weight < self.rules.follow_from:
+                break
+            action = self._follow(own, ways, here)
+            if action is not None:
+                return action
+        action = self._explore(ways, here)
+        if action is not None:
+            return action
+        # All is seen: take the best guess, then look at everything again.
+        best = self.hypotheses.best()
+        if best is not None and (action := self._follow(best, ways, here)) is not None:
+            return action
+        self.grid.forget_looks()
+        self.aim = 'lost'
+        tight = Ways(self.grid, off=0.08)
+        action = self._explore(tight, here)
+        if action is not None:
+            return action
+        return self._away(tight)
+
+    def _follow(self, own: Hypothesis, ways: Ways, here: tuple[int, int]) -> int | None:
+        """Towards a hypothesis; None: there is no way, or the robot has been there."""
+        gap, _ = apart(self.pose, own.pose)
+        if gap <= self.rules.reached_m:
+            turn = wrap_angle(float(own.pose[2] - self.pose[2]))
+            if abs(turn) > self.rules.reached_rad and abs(turn) > 0.55 * self._turn:
+                self.aim = 'turn'
+                return self._left if turn > 0 else self._right
+            self.hypotheses.refute(own)  # it stands there, and it was not said to have arrived
+            return None
+        row, column = self.grid.cell(*own.pose[:2])
+        reach = 5
+        rows, columns = np.mgrid[row - reach:row + reach + 1, column - reach:column + reach + 1]
+        inside = (rows >= 0) & (columns >= 0) & (rows < len(ways.passable)) & (
+            columns < len(ways.passable))
+        cells = np.stack([rows[inside], columns[inside]], axis=1)
+        far = np.hypot(*(cells - (row, column)).T)
+        good = ways.passable[cells[:, 0], cells[:, 1]] & (far <= reach)
+        if not good.any():
+            return None
+        field = ways.to(cells[good], 0.1 * 1.5 * far[good], here, through_unknown=True)
+        self.aim = 'follow'
+        return self._drive(field, ways, here)
+
+    def _explore(self, ways: Ways, here: tuple[int, int]) -> int | None:
+        """Towards unknown floor, or a turn that shows some."""
+        rules = self.rules
+        turns = np.arange(-math.ceil(math.pi / self._turn), math.ceil(math.pi / self._turn) + 1)
+        gains = self.grid.look_gains(*self.pose[:2], self.pose[2] + turns * self._turn,
+                                     self.bearings)
+        worth = np.minimum(rules.look_worth * gains, rules.look_most)
+        price = rules.look_cost * np.abs(turns) - np.where(gains >= rules.look_from, worth, -99.0)
+        price[turns == 0] = np.inf
+        price += np.where(self._turns_back(turns), rules.back_cost, 0)
+        best = int(np.argmin(price))
+        cells, head_start = ways.frontiers()
+        drive = None
+        if len(cells):
+            most = head_start.max()
+            field = ways.to(cells, most - head_start, here, through_unknown=False)
+            away = field[here] - most
+            if np.isfinite(away) and (price[best] > 50 or away < price[best]):
+                drive = self._drive(field, ways, here)
+        if drive is not None:
+            self.aim = 'explore'
+            return drive
+        if price[best] < 50:
+            self.aim = 'look'
+            return self._left if turns[best] > 0 else self._right
+        return None
+
+    def _drive(self, field: np.ndarray, ways: Ways, here: tuple[int, int]) -> int | None:
+        """The first action of turns and a move that lead on best; None: none does."""
+        rules = self.rules
+        most = math.ceil(math.pi / self._turn)
+        best, chosen = np.inf, None
+        for k in sorted(range(-most, most + 1), key=abs):
+            yaw = self.pose[2] + k * self._turn
+            for action in self._drives:
+                dx, dy, _ = self.moves[action]
+                length, angle = math.hypot(dx, dy), yaw + math.atan2(dy, dx)
+                if self._is_blocked(angle):
+                    continue
+                got, clear = ways.cut(*self.pose[:2], angle, length)
+                end = self.pose[:2] + got * np.array([math.cos(angle), math.sin(angle)])
+                cost = (self._at(field, end) + got + rules.turn_cost * abs(k)
+                        + rules.contact_cost * (length - got)
+                        + rules.graze_cost * max(1 - (clear - self.footprint) / rules.graze_m, 0)
+                        + (rules.backward_cost if dx <= 0 else 0.0)
+                        + (rules.back_cost if self._turns_back(np.array([k]))[0] else 0.0))
+                if got > 0.45 * length and cost < best:
+                    best = cost
+                    chosen = action if k == 0 else self._left if k > 0 else self._right
+        return None if chosen is None or not np.isfinite(best) else int(chosen)
+
+    def _at(self, field: np.ndarray, place: np.ndarray) -> float:
+        """A field's value at a place: of the best cell about it."""
+        row, column = self.grid.cell(*place)
+        part = field[max(row - 1, 0):row + 2, max(column - 1, 0):column + 2]
+        return float(field[row, column]) if np.isfinite(field[row, column]) else float(
+            part.min()) + 0.15
+
+    def _is_blocked(self, angle: float) -> bool:
+        """Whether a move in this direction [rad] met something about here before."""
+        here = np.array([*self.pose[:2], angle])
+        return any(gap < BLOCKED_M and turn < BLOCKED_RAD
+                   for gap, turn in (apart(here, own) for own in self._blocked))
+
+    def _turns_back(self, turns: np.ndarray) -> np.ndarray:
+        """Which numbers of turns begin by undoing the last action."""
+        if self._last == self._left:
+            return turns < 0
+        return turns > 0 if self._last == self._right else np.zeros(len(turns), bool)
+
+    def _away(self, ways: Ways) -> int:
+        """Any move that seems possible; else a turn."""
+        for action in self._drives:
+            dx, dy, _ = self.moves[action]
+            length = math.hypot(dx, dy)
+            angle = self.pose[2] + math.atan2(dy, dx)
+            if not self._is_blocked(angle) and ways.cut(*self.pose[:2], angle, length)[0] >= 0.9 * length and (
+                    self._last not in (self._left, self._right) or dx > 0):
+                return int(action)
+        return self._right if self._last == self._right else self._left
