@@ -1,5 +1,6 @@
 """Gymnasium environments as scenes: native actions, rewards and ends; figures without ways."""
 
+import contextlib
 import importlib.util
 import json
 
@@ -10,8 +11,10 @@ from gymnasium import spaces
 
 from vn_nav import cli
 from vn_nav.errors import UserError
-from vn_nav.evaluation.evaluator import random_actor, run_episodes
+from vn_nav.evaluation.evaluator import measure, random_actor, run_episodes
 from vn_nav.evaluation.metrics import summarise
+from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.report.tables import row_line
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.navigation.env import NavigationEnv
@@ -195,6 +198,16 @@ def test_figures_without_ways_are_dashes():
     assert all(words in line for words in ('SPL -', 'stop error -', 'seconds -'))
     json.dumps(figures, allow_nan=False)
     env.close()
+
+
+def test_no_stop_is_declared_where_the_simulator_ends_its_episodes():
+    def make(scenes, environments, stop):
+        return env_of(num_envs=environments, stop=stop, size=36)
+    with contextlib.closing(env_of(size=36)) as env:
+        network = build_policy(NetworkConfig(actions=env.action_names, size=36,
+                                             heads=('arrival',)))
+    rows = measure(make, network, [SCENE], decoding='sample', episodes=4, controls=())
+    assert list(rows) == ['arrival']
 
 
 @pytest.mark.slow

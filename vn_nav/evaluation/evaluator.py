@@ -196,8 +196,8 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
                         env, actor, rounds * environments, seed=seed + chunk,
                         robot=robot or env.robot))
                 own, _ = next(iter(actors.values()))
-                if env.config.task != 'image' or not (
-                        isinstance(own, PolicyActor) and own.knows_arrival):
+                if (env.config.task != 'image' or env.simulator.capabilities.rewards
+                        or not (isinstance(own, PolicyActor) and own.knows_arrival)):
                     break  # nothing to declare, or nobody to declare it
     return rows
 
