@@ -17,6 +17,8 @@ from vn_nav.policy.goal_maps import GoalMaps
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.search.driver import SearchDriver
+from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.zhu import check_scenes
 from vn_nav.policy.zhu_policy import ScenePolicy
 
@@ -82,6 +84,7 @@ class PolicyRuntime:
         stop_threshold: the one in force; None: the policy declares nothing.
         arrival: probability that the robot has arrived, by the head `arrival`, at the picture
             that `act` saw last; nan before it, and where the network has no such head.
+        search: map and hypotheses of a policy that searches; None: it is another.
 
     Raises:
         UserError: see `load_checkpoint`; an unknown decoding; a threshold out of range, or one
@@ -110,6 +113,7 @@ class PolicyRuntime:
         self.action_filter: str = checkpoint.config.filter_name
         self.filter_counts = FilterCounts()
         self._filter = make_filter(self.action_filter, self.moves, 1)
+        self.search = _search(self._network, 1)
         self.reset()
 
     @torch.inference_mode()
@@ -121,8 +125,10 @@ class PolicyRuntime:
 
     def reset(self) -> None:
         """Begin an episode: empty memory, no last action."""
-        self._state = self._network.initial_state(1)
+        if self.search is None:
+            self._state = self._network.initial_state(1)
         self._last_action = -1
+        self._starts = True
 
     def correct(self, action: int) -> None:
         """Say what was really done since `act`, where another driver has control.
@@ -140,7 +146,7 @@ class PolicyRuntime:
         return self.stop_threshold is not None and self.arrival > self.stop_threshold
 
     @torch.inference_mode()
-    def act(self, image: np.ndarray) -> int:
+    def act(self, image: np.ndarray, odometry: np.ndarray | None = None) -> int:
         """The next action for a picture, uint8 [3,S,S]; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
@@ -153,6 +159,8 @@ class PolicyRuntime:
         if self._goal_maps is None:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
+        if self.search is not None:
+            return self._search_on(picture, odometry)
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -170,6 +178,18 @@ class PolicyRuntime:
         self._state, self._last_action = state, action
         if self._filter is not None:  # where the policy declares its stop nothing is driven
             self.filter_counts.add(acted[0] and not self.arrived, changed[0] and not self.arrived)
+        if self.arrived:
+            self.reset()
+        return action
+
+    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None) -> int:
+        """`act` of a policy that searches."""
+        assert self.search is not None and self._goal_maps is not None
+        action = int(self.search.act(
+            picture.numpy(), self._goal_maps, np.array([self._last_action]),
+            np.array([self._starts]), None if odometry is None else odometry[None])[0])
+        self.arrival = float(self.search.arrival[0])
+        self._last_action, self._starts = action, False
         if self.arrived:
             self.reset()
         return action
@@ -207,7 +227,9 @@ class BatchedPolicy:
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self.logits: torch.Tensor | None = None
-        self._state: RecurrentState = network.initial_state(num_envs)
+        self.search = _search(network, num_envs)
+        self._state: RecurrentState | None = (
+            network.initial_state(num_envs) if self.search is None else None)
         self._goals: np.ndarray | None = None
         self._goal_maps = GoalMaps(network)
         config = network.config
@@ -246,6 +268,11 @@ class BatchedPolicy:
         maps = self._goal_maps.of(torch.from_numpy(goals),
                                   torch.from_numpy(np.asarray(obs['goal_index'])))
         last_action, reset_mask = np.asarray(obs['last_action']), np.asarray(reset_mask, bool)
+        if self.search is not None:
+            actions = self.search.act(obs['image'], maps, last_action, reset_mask,
+                                      obs.get('odometry'))
+            self.arrival = self.search.arrival.copy()
+            return actions
         observation = Observation(
             torch.from_numpy(obs['image'])[None], None, None,
             torch.from_numpy(last_action)[None],
@@ -262,6 +289,11 @@ class BatchedPolicy:
         if self._filter is not None:
             self.filtered = acted, changed
         return actions.numpy()
+
+
+def _search(network: Policy, num_envs: int) -> SearchDriver | None:
+    """What decides where the network only sees."""
+    return SearchDriver(network, num_envs) if isinstance(network, SearchPolicy) else None
 
 
 def _check_decoding(decoding: str) -> None:
