@@ -8,6 +8,7 @@ from vn_sim_bridge.counter_random import Stream, normal
 from vn_sim_bridge.navigation.base_motion import Counters
 from vn_sim_bridge.robot.odometry import advance_all, drift_errors_of_all
 
+_AXES = [0, 0, 1]  # dx and dy are measured by the way, dyaw by the turn
 LEVEL = 1.0  # of `odometry.drift_errors`: a good indoor base with a gyro
 
 
@@ -53,7 +54,7 @@ class EpisodeOdometry:
         """
         motion, errors = done[:, :3], None
         if self._kind == 'commanded':
-            motion = nominal[:, :3] * _share(tried, done)
+            motion = _commanded(nominal, tried, done)
         elif self._kind == 'drift':
             seeds, numbers, episodes = (part[:, None] for part in counters)
             errors = drift_errors_of_all(motion, LEVEL, normal(
@@ -62,9 +63,10 @@ class EpisodeOdometry:
         self.poses[env_ids] = advance_all(self.poses[env_ids], motion, errors)
 
 
-def _share(tried: np.ndarray, done: np.ndarray) -> np.ndarray:
-    """How far robots got of a way, twice, and of a turn, [K,3]; 1 where none was tried."""
-    sizes = [np.column_stack([np.hypot(part[:, 0], part[:, 1]), np.abs(part[:, 2])])
-             for part in (tried, done)]
-    share = np.divide(sizes[1], sizes[0], out=np.ones_like(sizes[0]), where=sizes[0] > 0)
-    return share[:, [0, 0, 1]]
+def _commanded(nominal: np.ndarray, tried: np.ndarray, done: np.ndarray) -> np.ndarray:
+    """What really happened [K,3] without what the base made of the nominal moves; see `add`."""
+    asked, got = (np.column_stack([np.hypot(part[:, 0], part[:, 1]), np.abs(part[:, 2])])[:, _AXES]
+                  for part in (nominal, tried))
+    moved = got > 0
+    # Wheels that only slip are turned all the same.
+    return np.where(moved, done[:, :3] * asked / np.where(moved, got, 1.0), nominal[:, :3])
