@@ -19,7 +19,8 @@ class NavigationVectorEnv(Protocol):
     """What a training needs.
 
     Observations: `image` [N,3,S,S] uint8, `goal_index` [N] int64 into `goals`, `last_action` [N]
-    int64 (-1 at an episode's start), `last_reward` [N] float32 (the sparse reward alone).
+    int64 (-1 at an episode's start), `last_reward` [N] float32 (the sparse reward alone); where
+    the robots have it, `odometry` [N,3] float64: x, y [m], yaw [rad] in a frame of the episode.
     `info` has at least `reset`, `success`, `collided` and `arrived`, each [N] bool, and the
     privileged outputs that were asked for.
     """
@@ -113,7 +114,7 @@ class MeasuredVectorEnv(NavigationVectorEnv, Protocol):
     ways), `path_length`, `decisions`, `goal` and `pose`, by environment.
     """
 
-    config: Any  # `task` and `stop`, as of `EnvConfig`
+    config: Any  # `task`, `stop` and `odometry`, as of `EnvConfig`
     places: Sequence[Any]  # with `name` and `plan()`
     place_index: Any  # [N] the place of each robot
     goal_poses: Any  # [G,4] x, y [m], yaw, pitch [rad]

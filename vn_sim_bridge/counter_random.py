@@ -36,6 +36,7 @@ class Stream(enum.IntEnum):
     ODOMETRY = 19  # errors of odometry
     VIEW = 20  # of a recorded place
     VIEW_APPEARANCE = 21
+    EPISODE_ODOMETRY = 22  # errors of odometry, of a decision; ODOMETRY: of a tick
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

@@ -116,7 +116,8 @@ class Capabilities:
 class Motion(NamedTuple):
     """What really happened in a move of K robots."""
 
-    delta: np.ndarray  # [K,4] float64: dx, dy [m], dyaw, dpitch [rad] in the frame at its start
+    # [K,4] float64: dx, dy [m], dyaw, dpitch [rad]; dx is along the mean of first and last heading
+    delta: np.ndarray
     collided: np.ndarray  # [K] bool: it ended at a contact
     reward: np.ndarray | None = None  # [K] float32, of a simulator that pays itself
     ended: np.ndarray | None = None  # [K] bool: and has ended the episode

@@ -47,6 +47,7 @@ def _config(folder):
     (['evaluate', 'models/house', '--bag', 'bags/house_drive', '--split', 'test'], 'seen_goals'),
     (['evaluate', 'models/house', '--bag', 'bags/house_drive', '--goals', '1'], 'four goals'),
     (['evaluate', 'models/house', '--margin', '0.2'], 'give --bag'),
+    (['evaluate', 'models/house', '--odometry', 'true'], 'policies that use it'),
     (['compare', '/nowhere', '--out', 'OUT'], '.html'),
     (['train', '--backend', 'thor', '--out', 'OUT'], 'backend'),
     (['train', '--rooms', '99', '--out', 'OUT'], 'rooms'),

@@ -180,8 +180,9 @@ def result_and_rows(stop_threshold=0.0, scenes=('house:7', 'house:8')):
     rows = measure(make_env, make_network(heads=('arrival',)), list(scenes), decoding='sample',
                    episodes=8, controls=('wrong goal', 'random actions'), threshold=stop_threshold)
     return {'checkpoint': 'a <b> run', 'simulator': 'house', 'world_version': '2', 'task': 'image',
-            'decoding': 'sample', 'max_decisions': 40, 'seed': 0, 'date': '2026-11-24',
-            'splits': {'scenes': split_figures(rows, scenes)}}, {'scenes': rows}
+            'decoding': 'sample', 'max_decisions': 40, 'seed': 0, 'odometry': 'drift',
+            'date': '2026-11-24', 'splits': {'scenes': split_figures(rows, scenes)}
+            }, {'scenes': rows}
 
 
 PLAN = {'bounds': [0, 0, 9, 6], 'walls': [[0, 0, 9, 0.1]], 'outside': [],

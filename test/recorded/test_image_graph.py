@@ -247,6 +247,23 @@ def test_where_robots_cannot_turn_the_shortest_path_backs_up():
     assert np.mean(ends) > 0.95
 
 
+@pytest.mark.parametrize(('kind', 'noise'), [('true', True), ('commanded', False)])
+def test_odometry_is_the_pose_also_where_turns_are_cut_off(kind, noise):
+    env = env_of(graph_of(line(4), goals=5), odometry=kind, noise=noise, stop='declared')
+    _, info = env.reset(seed=1)
+    start, rng, cut = info['pose'].copy(), np.random.default_rng(0), 0
+    c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
+    for _ in range(40):
+        actions = rng.integers(0, len(env.action_names), 6)
+        observation, _, _, _, info = env.step(actions)
+        x, y, yaw = observation['odometry'].T
+        assert np.abs(start[:, 0] + c * x - s * y - info['pose'][:, 0]).max() < 1e-9
+        assert np.abs(start[:, 1] + s * x + c * y - info['pose'][:, 1]).max() < 1e-9
+        assert np.abs(wrap_angle(start[:, 2] + yaw - info['pose'][:, 2])).max() < 1e-9
+        cut += (info['collided'] & (actions == env.action_names.index('rotate_left'))).sum()
+    assert cut
+
+
 def test_episodes_begin_at_pictures_and_lead_to_pictures(corridor):
     env = env_of(corridor, 32)
     observation, info = env.reset(seed=0)

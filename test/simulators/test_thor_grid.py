@@ -288,6 +288,23 @@ def test_the_shortest_path_takes_as_many_steps_as_the_file_says(dump):
     env.close()
 
 
+def test_odometry_is_metres_though_distances_are_steps(dump):
+    env = env_of(dump[0], odometry='true', stop='declared')
+    _, info = env.reset(seed=0)
+    start, rng, moved = info['pose'].copy(), np.random.default_rng(0), 0.0
+    c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
+    for _ in range(40):
+        seen, _, _, _, info = env.step(rng.integers(0, len(env.action_names), 6))
+        x, y, yaw = seen['odometry'].T
+        there = np.stack([c * x - s * y, s * x + c * y], 1) + start[:, :2]
+        assert np.abs(there - info['pose'][:, :2]).max() < 1e-9
+        turn = start[:, 2] + yaw - info['pose'][:, 2]
+        assert np.abs(np.sin(turn / 2)).max() < 1e-9
+        moved = max(moved, np.hypot(x, y).max())
+    assert moved >= 0.5
+    env.close()
+
+
 def test_features_of_the_file_reach_the_network_uncomputed(dump):
     """The network has no encoder: a picture that reached it would be an error."""
     path, data = dump

@@ -187,11 +187,13 @@ def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, scene: str, co
     and those behind sampled actions.
     """
     same = bridge_parameters(checkpoint, scene, count, limit)
+    # The bridge's odometry: noise is unseen, and its wheels do not drift unless somebody says so.
+    odometry = 'commanded' if checkpoint.network.uses_odometry else 'none'
     # The seed of the goal pictures' light is the configuration's, whatever `reset` is given.
     return make_env([same['scene']], same['episodes'], size=same['size'],
                     randomisation=same['randomisation'], seed=same['seed'], stop=same['stop'],
                     robot=Path(same['robot']), max_decisions=same['max_decisions'],
-                    actions=checkpoint.config.actions)
+                    actions=checkpoint.config.actions, odometry=odometry)
 
 
 def _drive(console: Console, processes: Processes, folder: Path, checkpoint: LoadedCheckpoint,
@@ -260,6 +262,7 @@ def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint) -> dict:
         in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
         env.close()
         result[place] = figures | {'scene': scene, 'max_decisions': limit, 'stop': stop,
+                                   'odometry': env.config.odometry,
                                    'random': summarise(control),
                                    'without_ros': summarise(in_process),
                                    'minus_without_ros': _paired(drive.episodes, in_process)}

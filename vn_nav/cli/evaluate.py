@@ -24,7 +24,7 @@ from vn_nav.cli.world import (
 )
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
-from vn_nav.evaluation.measurement import EvaluateConfig, evaluate
+from vn_nav.evaluation.measurement import EvaluateConfig, evaluate, odometry_for
 from vn_nav.files import write_file
 from vn_nav.learning.teach_evaluation import DRIVE_SPLITS
 from vn_nav.report import tables
@@ -58,6 +58,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--decoding', choices=('sample', 'greedy'))
     parser.add_argument('--stop-threshold', type=float, metavar='P', help='probability above '
                         "which the arrival head declares a stop (default: the checkpoint's)")
+    parser.add_argument('--odometry', choices=('true', 'drift', 'commanded', 'none'),
+                        help='that a policy which uses odometry is given: what really happened, '
+                        'that with the errors of a good base, or the moves as commanded (default: '
+                        'drift; none for other policies)')
     parser.add_argument('--no-controls', action='store_true')
     parser.add_argument('--per-scene', action='store_true', help='print each scene as well')
     parser.add_argument('--json', type=Path, metavar='FILE', help='also write the figures here')
@@ -74,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
         controls=() if args.no_controls else evaluator.CONTROLS,
         stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None)
     checkpoint, robot = load_for(args.checkpoint, args.robot)
+    odometry = odometry_for(checkpoint.network, args.odometry)
     bag = args.bag.name if args.bag else None
 
     def show(name: str, result: dict) -> None:
@@ -86,8 +91,8 @@ def run(args: argparse.Namespace) -> int:
 
     with tempfile.TemporaryDirectory() as decoded:  # the pictures of a drive are mapped from there
         splits, make_env = (
-            _drive(args, checkpoint, robot, args.cache or Path(decoded)) if args.bag else
-            _scenes(args, checkpoint))
+            _drive(args, checkpoint, robot, args.cache or Path(decoded), odometry) if args.bag else
+            _scenes(args, checkpoint, odometry))
         done = evaluate(checkpoint, splits, make_env, config, name=str(args.checkpoint), bag=bag,
                         on_split=show)
     if args.json:
@@ -169,7 +174,7 @@ def _rooms(info: dict) -> int | None:
     return rooms_of(info['scenes'][0]) if info['scenes'] else None
 
 
-def _scenes(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
+def _scenes(args: argparse.Namespace, checkpoint, odometry: str) -> tuple[dict, Callable]:
     """The scenes of each split, and what makes environments of them."""
     splits = _splits(args, checkpoint.info)
     for scenes in splits.values():
@@ -187,11 +192,12 @@ def _scenes(args: argparse.Namespace, checkpoint) -> tuple[dict, Callable]:
             checkpoint, names, environments, stop=stop, robot=args.robot,
             own=set(splits[split]) <= set(checkpoint.info['scenes']),
             randomisation=args.randomisation, max_decisions=args.max_decisions,
-            goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0, say=say)
+            goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0, odometry=odometry, say=say)
     return splits, make
 
 
-def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[dict, Callable]:
+def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path, odometry: str
+           ) -> tuple[dict, Callable]:
     """The goals of each split in a recorded drive, and what makes environments there."""
     from vn_nav.bags.mapping.recorded_place import read_place
     from vn_sim_bridge import teach_place as place
@@ -209,5 +215,6 @@ def _drive(args: argparse.Namespace, checkpoint, robot, cache: Path) -> tuple[di
 
     def make(split: str, _, environments: int, stop: str):
         return place.make_env(graphs[split], robot, environments, stop=stop, light=True,
-                              task=checkpoint.info['task'], max_decisions=args.max_decisions)
+                              task=checkpoint.info['task'], max_decisions=args.max_decisions,
+                              odometry=odometry)
     return {name: [graph.name] for name in graphs}, make

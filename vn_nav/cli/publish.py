@@ -10,7 +10,7 @@ from pathlib import Path
 from vn_nav.cli.world import load_for_scenes, machine, make_env_for
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
-from vn_nav.evaluation.measurement import EvaluateConfig, measure_checkpoint
+from vn_nav.evaluation.measurement import EvaluateConfig, measure_checkpoint, odometry_for
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.report import tables
 from vn_nav.robot import load_robot
@@ -56,8 +56,10 @@ def run(args: argparse.Namespace) -> int:
             kind = '' if stop == evaluator.ARRIVAL else 'declared stop, '
             info['results'] |= {f'{place}: {kind}{name}': figures
                                 for name, figures in row.items()}
+    odometry = odometry_for(shipped.network)
+    named = '' if odometry == 'none' else f'odometry: {odometry}, '
     info['notes'] += (f' Measured with `vn_nav publish`, {args.episodes} episodes a row, 300 '
-                      f'decisions at most, motion noise on, on {machine()}, '
+                      f'decisions at most, motion noise on, {named}on {machine()}, '
                       f'{datetime.date.today().isoformat()}. Figures are defined in '
                       'docs/architecture.md.')
     save_checkpoint(args.target, shipped.network, info, half=True)

@@ -11,6 +11,7 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
+from vn_nav.policy.network import Policy
 from vn_nav.robot import RobotSpec
 
 
@@ -64,7 +65,7 @@ class Evaluation:
 
 
 def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions: int,
-               decoding: str, seed: int) -> dict:
+               decoding: str, seed: int, odometry: str) -> dict:
     """A result without splits: what all of them have in common.
 
     Args:
@@ -75,13 +76,31 @@ def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions
         max_decisions: of an episode.
         decoding: 'sample' or 'greedy'.
         seed: of the episodes.
+        odometry: that the policy was given: true, drift, commanded, or none.
     """
     return {'checkpoint': checkpoint,
             **({'sha256': info['sha256']} if 'sha256' in info else {}),
             'bag': bag, 'simulator': info['simulator'],
             'world_version': info['world_version'], 'task': info['task'],
             'decoding': decoding, 'max_decisions': max_decisions, 'seed': seed,
+            'odometry': odometry,
             'date': datetime.date.today().isoformat(), 'splits': {}}
+
+
+def odometry_for(network: Policy, wanted: str | None = None) -> str:
+    """The odometry that a policy is measured with: true, drift, commanded, or none.
+
+    Args:
+        network: the policy.
+        wanted: by the user; None: drift where the policy uses odometry, else none.
+
+    Raises:
+        UserError: the policy uses none.
+    """
+    if wanted not in (None, 'none') and not network.uses_odometry:
+        raise UserError('odometry is for policies that use it', f'{wanted}; this one uses none',
+                        'leave it out (--odometry)')
+    return wanted or ('drift' if network.uses_odometry else 'none')
 
 
 def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make_env: Callable,
@@ -136,20 +155,21 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
     done = Evaluation({}, {}, {})
     for split, scenes in splits.items():
         plans = done.plans[split] = {}
-        limits: list[int] = []
+        configs: list[Any] = []
         world: dict[str, str] = {}
 
         def make(names: Sequence[str], environments: int, stop: str, split: str = split,
-                 plans: dict = plans, limits: list[int] = limits, world: dict = world):
+                 plans: dict = plans, configs: list[Any] = configs, world: dict = world):
             env = make_env(split, names, environments, stop)
             world.update(simulator=env.simulator_name, world_version=env.world_version)
             plans.update({place.name: place.plan() for place in env.places})
-            limits.append(env.config.max_decisions)
+            configs.append(env.config)
             return env
 
         measured = done.measured[split] = measure_checkpoint(checkpoint, scenes, make, config)
         done.result = done.result or new_result(
-            {**checkpoint.info, **world}, checkpoint=name, bag=bag, max_decisions=limits[0],
+            {**checkpoint.info, **world}, checkpoint=name, bag=bag,
+            max_decisions=configs[0].max_decisions, odometry=configs[0].odometry,
             decoding=config.decoding or checkpoint.info['decoding'], seed=config.seed)
         done.result['splits'][split] = evaluator.split_figures(measured, scenes)
         on_split(split, done.result)

@@ -20,7 +20,7 @@ import torch
 from vn_nav.bags.mapping.recorded_place import read_place
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
-from vn_nav.evaluation.measurement import new_result
+from vn_nav.evaluation.measurement import new_result, odometry_for
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.places import BATCH, MAX_START_PICTURES, fit_paths, fit_places
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig
@@ -158,7 +158,9 @@ class Teaching:
         self.stages('what an evaluation costs', 0.0)
         most = min(self.job.episodes, evaluator.ENVIRONMENTS)
         few = min(MIN_EPISODES, most)
-        self.costs = [cost_of(functools.partial(self._env, self.own, stop=evaluator.ARRIVAL),
+        odometry = self._odometry(network)
+        self.costs = [cost_of(functools.partial(self._env, self.own, stop=evaluator.ARRIVAL,
+                                                odometry=odometry),
                               network, envs)
                       for envs in (few, max(most, few + 1))]
         splits = [name for name, graph in self._graphs().items() if graph is not None]
@@ -207,12 +209,15 @@ class Teaching:
         threshold = known or evaluator.STOP_THRESHOLD
         # The checkpoint is written again with what is measured: its checksum is not final.
         info = {key: value for key, value in taught.info.items() if key != 'sha256'}
+        odometry = self._odometry(taught.network)
         result = new_result(info, checkpoint=str(self.folder), bag=self.bag.name,
-                            max_decisions=MAX_DECISIONS, decoding=DECODING, seed=EVALUATION_SEED)
+                            max_decisions=MAX_DECISIONS, decoding=DECODING, seed=EVALUATION_SEED,
+                            odometry=odometry)
         graphs = {name: graph for name, graph in self._graphs().items() if graph is not None}
         self.evaluation = Evaluation(
             self.out, result, graphs,
-            lambda graph, envs, stop: self._env(graph, envs, stop=stop), self.robot, threshold)
+            lambda graph, envs, stop: self._env(graph, envs, stop=stop, odometry=odometry),
+            self.robot, threshold)
         try:
             self.evaluation.run(self._plan(self.stages.left - WRITE_TIME_S), taught.network,
                                 self.given.network if self.given else None, self.stages)
@@ -262,6 +267,12 @@ class Teaching:
     def _env(self, graph: Any, envs: int, **options) -> Any:
         options = {'max_decisions': MAX_DECISIONS} | options
         return self.place.make_env(graph, self.robot, envs, light=True, **options)
+
+    def _odometry(self, network: Policy) -> str:
+        """That the taught policy is measured with, and the one before it in the same places."""
+        found = [odometry_for(one) for one in (network, *(
+            [self.given.network] if self.given else []))]
+        return next((name for name in found if name != 'none'), 'none')
 
     def _pairs(self) -> tuple[PairSource, PairSource]:
         source, judge = self.place.make_pairs(self.own, self.others, self.robot, self.job.seed)

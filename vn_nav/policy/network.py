@@ -53,6 +53,8 @@ class Policy(nn.Module):
 
     Attributes:
         frozen: whether pictures pass an encoder that learns nothing before anything else.
+        uses_odometry: whether it takes what the robot's odometry says of its motion; a figure of
+            such a policy says which odometry that was.
         compute_dtype: type of the convolutions and matrix products; parameters, memory and
             outputs are float32 in any case.
         heads: the auxiliary heads by name.
@@ -61,6 +63,7 @@ class Policy(nn.Module):
     """
 
     frozen = False
+    uses_odometry = False
     encoder: Encoder | Siamese
     memory: Feedforward | MaskedLSTM | SceneLinear
     actor: nn.Linear | SceneLinear

@@ -247,7 +247,9 @@ class BatchedPolicy:
 
         Args:
             obs: `image` [N,3,S,S] uint8, `goal_index` [N], `last_action` [N], `last_reward` [N];
-                `features` [N,F] float32, if somebody has computed them, see `takes_features`.
+                `features` [N,F] float32, if somebody has computed them, see `takes_features`;
+                `odometry` [N,3] float64, if the robots have it: x, y [m], yaw [rad] in a frame of
+                the episode (a network that does not use it ignores it).
             goals: [G,3,S,S] uint8, or their features [G,F] float32; encoded again only when
                 another array is passed, so do not write into one.
             reset_mask: [N] bool, where an episode begins with this observation.

@@ -37,6 +37,9 @@ that succeeded without any.</dd>
 offset an action (an action without progress there is blocked, and after much turning driving on is
 pushed); share at which another action came out than without it.</dd>
 <dt>Stop error</dt><dd>Distance and angle to the goal at the end of all episodes.</dd>
+<dt>Odometry</dt><dd>What the policy was told of its own motion. <i>True</i>: what really
+happened; <i>drift</i>: that, with the errors of a good indoor base; <i>commanded</i>: the moves as
+commanded, cut off at contacts; <i>none</i>: nothing.</dd>
 <dt>Wrong goal, blank goal</dt><dd>The same policy on the same starts, but shown the picture of
 another goal of the scene, or plain grey; it is still measured at the right place. A policy that
 looks at its picture falls far behind here.</dd></dl>"""
@@ -58,7 +61,8 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
 <p class="soft">Simulator {html.escape(str(result['simulator']))}, world version
 {html.escape(str(result['world_version']))}, task
 {html.escape(result['task'])}, actions by the rule <i>{result['decoding']}</i>, at most
-{result['max_decisions']} decisions an episode, seed {result['seed']}. vn_nav {__version__},
+{result['max_decisions']} decisions an episode, seed {result['seed']}, odometry:
+{html.escape(result['odometry'])}. vn_nav {__version__},
 {result['date']}.</p>
 {body}
 {DEFINITIONS}""")

@@ -25,6 +25,7 @@ from vn_sim_bridge.navigation.env_config import (
     setup_for,
     with_own_actions,
 )
+from vn_sim_bridge.navigation.episode_odometry import EpisodeOdometry
 from vn_sim_bridge.navigation.episodes import draw_motion_scale, draw_variant
 from vn_sim_bridge.navigation.exploration import Exploration
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
@@ -47,6 +48,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
 
     Autoreset is NEXT_STEP: the step after an episode's end ignores its action and returns the new
     episode's first observation with reward 0; `info['reset']` marks these rows: no frames.
+
+    With `config.odometry` there is also `odometry` [N,3] float64: x, y [m], yaw [rad] as the
+    robots' own odometry has them, in a frame of its own that begins at (0, 0, 0) with every
+    episode: x ahead of where the robot starts, y to its left (see `EpisodeOdometry`).
 
     With `stop='declared'` arriving ends no episode. `step` then takes one more number,
     `declare_action`, which says "I have arrived": the robot stays where it is and the episode
@@ -100,6 +105,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.action_names = self.robot.action_names
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
         self._base = BaseMotion(config, self.robot)
+        self._odometry = None if config.odometry == 'none' else EpisodeOdometry(config.odometry, n)
         self._views = GoalViews(
             self.simulator, self.task.views, variants=config.pictures_per_goal, size=config.size,
             seed=config.seed,
@@ -167,6 +173,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'last_action': spaces.Discrete(actions + 1, start=-1),
             'last_reward': spaces.Box(-np.inf, np.inf, (), np.float32),
             **features,
+            **({} if self._odometry is None else {
+                'odometry': spaces.Box(-np.inf, np.inf, (3,), np.float64)}),
         })
         self.single_action_space = spaces.Discrete(self._choices)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -238,6 +246,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                      'explorer_found': self._explorer.explorer.found.copy()}
         if self._exploration is not None:
             more['visited'] = self._exploration.visited.copy()
+        if self._odometry is not None:
+            more['odometry'] = self._odometry.poses.copy()
         return {'poses': self.simulator.poses.copy(), **self._seeds.get_state(), **more,
                 **{name.strip('_'): getattr(self, name).copy() for name in self._state},
                 **{f'objects_{name}': part.copy() for name, part in objects._asdict().items()},
@@ -263,6 +273,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             self._explorer.explorer.found[:] = state['explorer_found']
         if self._exploration is not None:
             self._exploration.visited[:] = state['visited']
+        if self._odometry is not None:
+            self._odometry.poses[:] = state['odometry']
         for name, part in self.simulator.objects._asdict().items():
             part[:] = state[f'objects_{name}']
         for name, part in self.task.state.items():
@@ -343,10 +355,13 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         """Move some robots. On a grid nothing is noisy, slips or is worn."""
         if self.simulator.capabilities.own_actions:
             return self.simulator.act(actions, acting)
-        delta = (self._base.driven(actions, self._counters(acting), self._step[acting],
-                                   self._motion_scale[acting])
+        counters, step = self._counters(acting), self._step[acting]
+        delta = (self._base.driven(actions, counters, step, self._motion_scale[acting])
                  if self.simulator.capabilities.continuous else self._base.deltas[actions])
         motion = self.simulator.move(delta, acting)
+        if self._odometry is not None:
+            self._odometry.add(acting, self._base.deltas[actions], delta, motion.delta, counters,
+                               step)
         self._path_length[acting] += (1.0 if self.simulator.capabilities.steps else np.hypot(
             motion.delta[:, 0], motion.delta[:, 1]))
         return motion
@@ -384,6 +399,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._path_length[env_ids] = 0.0
         self._last_action[env_ids] = -1
         self._last_reward[env_ids] = 0.0
+        if self._odometry is not None:
+            self._odometry.begin(env_ids)
         self._measure(env_ids)
         # Where nobody knows the ways no figure is made of the shortest one.
         known = self.simulator.capabilities.geodesic
@@ -435,6 +452,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if self.simulator.feature_size:
             observation['features'] = self.simulator.features(self.place_index,
                                                               self.simulator.poses)
+        if self._odometry is not None:
+            observation['odometry'] = self._odometry.poses.copy()
         info = {
             'reset': reset,
             'success': success,

@@ -23,6 +23,7 @@ OPTIONAL = {'progress_reward': 'the simulator knows no driving distances',
             'exploration_reward': 'the simulator has no floor map',
             'randomisation': 'light and camera do not vary in this simulator'}
 STOPS = ('arrival', 'declared')
+ODOMETRIES = ('none', 'true', 'drift', 'commanded')  # see `episode_odometry.EpisodeOdometry`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +57,7 @@ class EnvConfig:
     goal_variants: int | None = None  # pictures of each goal; default: the randomisation's
     goal_seed: int = 0  # 0: the scenes' own goals, else other ones in the same scenes
     exploration_reward: float = 0.0  # per square of floor that is new to the episode, see SQUARE
+    odometry: str = 'none'  # of ODOMETRIES: what the robots observe of their own motion
 
     def __post_init__(self):
         one_simulator(self.scenes)
@@ -73,6 +75,8 @@ class EnvConfig:
             (self.goal_variants is None or 1 <= self.goal_variants <= 256,
              'a goal has 1 to 256 pictures', self.goal_variants),
             (self.goal_seed >= 0, 'the seed of goals is not negative', self.goal_seed),
+            (self.odometry in ODOMETRIES, f'the odometry is one of {", ".join(ODOMETRIES)}',
+             self.odometry),
         )
         for kept, rule, received in rules:
             if not kept:
@@ -185,6 +189,8 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
         (can.own_actions == all(isinstance(action, NamedAction) for action in robot.actions),
          'a simulator with actions of its own takes those, and no other takes such ones',
          robot.action_names),
+        (config.odometry == 'none' or not can.own_actions,
+         'odometry needs robots that move in metres; there it is none', config.odometry),
         (can.geodesic or not config.progress_reward,
          'progress_reward needs a simulator that knows ways', config.progress_reward),
         (can.geodesic or simulator.planner or 'oracle_action' not in told,

@@ -16,7 +16,8 @@ from vn_sim_bridge.render.randomisation import load_randomisation
 class Navigation(gymnasium.Env):
     """One robot in one scene, for tools that want a single `gymnasium.Env`.
 
-    Observations: `image` and `goal`, both [3,H,W] uint8. Registered as `vn_nav/Navigation-v0`;
+    Observations: `image` and `goal`, both [3,H,W] uint8; with the option `odometry` also that,
+    [3] float64, see `NavigationEnv`. Registered as `vn_nav/Navigation-v0`;
     `vn_nav/House-v0` is short for that with the scene of a house, by its seed and rooms.
 
     Args:
@@ -37,7 +38,9 @@ class Navigation(gymnasium.Env):
         self._batch = NavigationEnv(EnvConfig(scenes=(scene,), num_envs=1, **options))
         size = self._batch.config.size
         picture = spaces.Box(0, 255, (3, size, size), np.uint8)
-        self.observation_space = spaces.Dict({'image': picture, 'goal': picture})
+        odometry = {} if self._batch.config.odometry == 'none' else {
+            'odometry': spaces.Box(-np.inf, np.inf, (3,), np.float64)}
+        self.observation_space = spaces.Dict({'image': picture, 'goal': picture, **odometry})
         self.action_space = self._batch.single_action_space
         self._image = np.zeros((3, size, size), np.uint8)
 
@@ -70,7 +73,8 @@ class Navigation(gymnasium.Env):
     def _single(self, observation) -> dict:
         self._image = observation['image'][0]
         return {'image': self._image.copy(),
-                'goal': self._batch.goals[observation['goal_index'][0]].copy()}
+                'goal': self._batch.goals[observation['goal_index'][0]].copy(),
+                **({'odometry': observation['odometry'][0]} if 'odometry' in observation else {})}
 
 
 class HouseNavigation(Navigation):

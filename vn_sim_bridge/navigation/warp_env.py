@@ -52,7 +52,7 @@ class WarpNavigationEnv:
     as well.
 
     Args:
-        config: task 'image', without late pictures; none of `TEACHERS` is privileged.
+        config: task 'image', without late pictures or odometry; none of `TEACHERS` is privileged.
         robot: the standard robot if left out.
         device: Warp device, such as 'cuda:0' or 'cpu'.
     """
@@ -66,6 +66,9 @@ class WarpNavigationEnv:
         if config.stop != 'arrival' or config.exploration_reward:
             raise UserError('on the device episodes end on arrival, and new floor pays nothing',
                             (config.stop, config.exploration_reward), 'use NavigationEnv')
+        if config.odometry != 'none':
+            raise UserError('robots on the device have no odometry', config.odometry,
+                            'use NavigationEnv (--device cpu), or odometry none')
         if teachers := sorted(set(config.privileged) & set(TEACHERS)):
             raise UserError('teachers plan on the CPU: the device tells no actions to imitate',
                             ', '.join(teachers), 'set imitation=0 and teacher_share=0 (--set '

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from vn_sim_bridge.floor.contacts import ROTATION_NOISE, TRANSLATION_NOISE
 # [rad^2] and of the way [m^2], for each radian turned and each metre driven.
 HEADING_BY_TURN, HEADING_BY_WAY = 1e-5, 5e-5
 WAY_BY_WAY, WAY_BY_TURN = 4e-4, 2e-5
+
+Numbers = TypeVar('Numbers', float, np.ndarray)
 
 
 def drift_errors(motion: Sequence[float], drift: float, normals: Sequence[float] | np.ndarray
@@ -42,9 +45,14 @@ def drift_errors(motion: Sequence[float], drift: float, normals: Sequence[float]
 
 def _deviations(motion: Sequence[float], drift: float) -> tuple[float, float]:
     """Standard deviations of either rotation [rad] and of the way [m]."""
-    way, turn = math.hypot(motion[0], motion[1]), abs(motion[2])
-    return (drift * math.sqrt((HEADING_BY_TURN * turn + HEADING_BY_WAY * way) / 2),
-            drift * math.sqrt(WAY_BY_WAY * way + WAY_BY_TURN * turn))
+    rotation, along = _variances(math.hypot(motion[0], motion[1]), abs(motion[2]))
+    return drift * math.sqrt(rotation), drift * math.sqrt(along)
+
+
+def _variances(way: Numbers, turn: Numbers) -> tuple[Numbers, Numbers]:
+    """Of either rotation [rad^2] and of the way [m^2], at drift 1."""
+    return ((HEADING_BY_TURN * turn + HEADING_BY_WAY * way) / 2,
+            WAY_BY_WAY * way + WAY_BY_TURN * turn)
 
 
 def advance(pose: np.ndarray, motion: Sequence[float],
@@ -64,6 +72,29 @@ def advance(pose: np.ndarray, motion: Sequence[float],
     cos, sin = math.cos(heading), math.sin(heading)
     return np.array([pose[0] + cos * dx - sin * dy, pose[1] + sin * dx + cos * dy,
                      wrap_angle(pose[2] + dyaw + before + after)])
+
+
+def drift_errors_of_all(motions: np.ndarray, drift: float, normals: np.ndarray) -> np.ndarray:
+    """`drift_errors` of the motions [K,3] of K robots, by their normals [K,3]: [K,3]."""
+    rotation, along = (drift * np.sqrt(variance) for variance in _variances(
+        np.hypot(motions[:, 0], motions[:, 1]), np.abs(motions[:, 2])))
+    return normals * np.stack([rotation, along, rotation], axis=1)
+
+
+def advance_all(poses: np.ndarray, motions: np.ndarray, errors: np.ndarray | None = None
+                ) -> np.ndarray:
+    """`advance` of the poses [K,3] of K robots, by their motions and errors [K,3]: [K,3]."""
+    errors = np.zeros_like(motions) if errors is None else errors
+    way = np.hypot(motions[:, 0], motions[:, 1])
+    on_the_spot = way == 0
+    share = errors[:, 1] / np.where(on_the_spot, 1.0, way)
+    dx = np.where(on_the_spot, errors[:, 1], motions[:, 0] * (1 + share))
+    dy = np.where(on_the_spot, 0.0, motions[:, 1] * (1 + share))
+    heading = poses[:, 2] + motions[:, 2] / 2 + errors[:, 0]
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.stack([poses[:, 0] + cos * dx - sin * dy, poses[:, 1] + sin * dx + cos * dy,
+                     wrap_angle(poses[:, 2] + motions[:, 2] + errors[:, 0] + errors[:, 2])],
+                    axis=1)
 
 
 class Uncertainty:

@@ -1,0 +1,75 @@
+"""A figure of a policy that uses odometry says which; the policy gets it on every path."""
+
+import json
+
+import numpy as np
+import pytest
+from ros_harness import write_checkpoint
+
+from vn_nav.cli import main
+from vn_nav.cli.demo import control_env
+from vn_nav.cli.world import make_env, make_env_for
+from vn_nav.errors import UserError
+from vn_nav.evaluation.measurement import odometry_for
+from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.policy.network import Policy
+from vn_nav.policy.runtime import BatchedPolicy
+
+
+@pytest.fixture
+def using(monkeypatch):
+    """All networks use odometry; the observations that policies act on."""
+    monkeypatch.setattr(Policy, 'uses_odometry', True)
+    seen, act = [], BatchedPolicy.act
+
+    def recording(self, obs, *rest):
+        seen.append(obs)
+        return act(self, obs, *rest)
+    monkeypatch.setattr(BatchedPolicy, 'act', recording)
+    return seen
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    return write_checkpoint(tmp_path_factory.mktemp('policy') / 'model', size=36)
+
+
+def measured(folder, tmp_path, *options):
+    out = tmp_path / 'figures.json', tmp_path / 'page.html'
+    assert main(['evaluate', str(folder), '--episodes', '2', '--max-decisions', '4',
+                 '--no-controls', '--maps', '0', '--json', str(out[0]), '--html', str(out[1]),
+                 *options]) == 0
+    return json.loads(out[0].read_text()), out[1].read_text()
+
+
+@pytest.mark.parametrize(('options', 'kind'), [
+    ((), 'drift'), (('--odometry', 'commanded'), 'commanded'), (('--odometry', 'none'), 'none')])
+def test_evaluate_names_the_odometry_that_the_policy_got(folder, tmp_path, using, options, kind):
+    result, page = measured(folder, tmp_path, *options)
+    assert result['odometry'] == kind
+    assert f'odometry:\n{kind}.' in page
+    assert using and all(('odometry' in seen) == (kind != 'none') for seen in using)
+    if kind != 'none':
+        assert not using[0]['odometry'].any() and any(s['odometry'].any() for s in using)
+
+
+def test_other_policies_get_none_and_take_none(folder, tmp_path):
+    result, page = measured(folder, tmp_path)
+    assert result['odometry'] == 'none' and 'odometry:\nnone.' in page
+    network = load_checkpoint(folder).network
+    assert network.uses_odometry is False and odometry_for(network, 'none') == 'none'
+    with pytest.raises(UserError, match='leave it out'):
+        odometry_for(network, 'true')
+
+
+def test_figures_of_publish_and_demo_have_it(folder, using):
+    """`publish` measures in `make_env_for`; the demo's control as the bridge reports."""
+    checkpoint = load_checkpoint(folder)
+    env = make_env_for(checkpoint, ['house:7'], 2, stop='arrival', own=True)
+    observation, info = env.reset(seed=0)
+    assert env.config.odometry == 'drift' and observation['odometry'].shape == (2, 3)
+    policy = BatchedPolicy(checkpoint.network, 2)
+    policy.act(observation, env.goals, info['reset'])
+    assert np.array_equal(using[0]['odometry'], observation['odometry'])
+    env = control_env(make_env, checkpoint, 'house:7', 1, 5)
+    assert env.config.odometry == 'commanded'
