@@ -126,7 +126,7 @@ def test_roc_and_calibration_by_counting():
 
 
 def test_figures_of_a_perfect_eye():
-    distance = np.array([0.3, 1.0, 0.3, 5.0, 1.4])
+    distance = np.array([0.3, 1.0, 0.3, 5.0, 1.6])
     turn = np.radians([10, 20, 45, 170, 50])
     there = np.array([True, False, False, False, False])
     perfect = Judged(

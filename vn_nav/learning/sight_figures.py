@@ -21,9 +21,10 @@ FIFTH = 0.2  # of a range
 BINS = 10  # of a calibration
 HALF_RADIUS = 1.678347  # half of the density exp(-r) in the plane lies within this r
 BANDS = {'quarter': (0.25, 0.5), 'half': (0.5, 1.01)}  # shares of the goal picture in view
-FIGURES = ('loss', *(f'{part}_loss' for part in WEIGHTS), 'bearing_deg',
-           *(f'position_m_{band}' for band in BANDS), 'heading_deg', 'co_visible_auc',
-           'arrived_auc', 'arrived_ring_auc', 'co_visible_calibration', 'arrived_calibration',
+FAR = 1.5  # m: goals beyond are those that a search finds first
+FIGURES = ('loss', *(f'{part}_loss' for part in WEIGHTS), 'bearing_deg', 'far_bearing_deg',
+           'far_position_m', *(f'position_m_{band}' for band in BANDS), 'heading_deg',
+           'co_visible_auc', 'arrived_auc', 'arrived_ring_auc', 'co_visible_calibration', 'arrived_calibration',
            'position_coverage', 'range_error', 'range_within_fifth')
 
 
@@ -93,11 +94,14 @@ def figures(judged: Judged) -> dict[str, float]:
     far = sees & (judged.distance > 0.3)  # nearer, a bearing means nothing
     bands = {f'position_m_{name}': _median(judged.position_error[in_band(judged.overlap, band)])
              for name, band in BANDS.items()}
+    beyond = sees & (judged.distance > FAR)
     off = np.abs(judged.range_ratio[np.isfinite(judged.range_ratio)] - 1)
     return {
         'loss': sum(WEIGHTS[name] * value for name, value in judged.losses.items()),
         **{f'{name}_loss': value for name, value in judged.losses.items()},
-        'bearing_deg': math.degrees(_median(judged.bearing_error[far])), **bands,
+        'bearing_deg': math.degrees(_median(judged.bearing_error[far])),
+        'far_bearing_deg': math.degrees(_median(judged.bearing_error[beyond])),
+        'far_position_m': _median(judged.position_error[beyond]), **bands,
         'heading_deg': math.degrees(_median(judged.heading_error[sees])),
         'co_visible_auc': auc(judged.co_visible[known], sees[known]),
         'arrived_auc': auc(judged.arrived, judged.there),

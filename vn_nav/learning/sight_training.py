@@ -326,8 +326,10 @@ def _line(row: dict[str, float], steps: int) -> str:
     """A report in a line."""
     def said(name: str, form: str) -> str:
         return format(row[f'validation_{name}'], form)
+    # Positions: far ones; a quarter to a half in view; more.
     return (f'{row["minutes"]:.1f} min · {steps:,} steps · loss {row["loss"]:.2f} '
-            f'({said("loss", ".2f")}) · bearing {said("bearing_deg", ".1f")} deg · position '
+            f'({said("loss", ".2f")}) · bearing {said("bearing_deg", ".1f")} (far '
+            f'{said("far_bearing_deg", ".1f")}) deg · position {said("far_position_m", ".2f")} / '
             f'{said("position_m_quarter", ".2f")} / {said("position_m_half", ".2f")} m · heading '
             f'{said("heading_deg", ".1f")} deg · AUC in view {said("co_visible_auc", ".3f")}, '
             f'arrived {said("arrived_auc", ".3f")}, in the ring {said("arrived_ring_auc", ".3f")} '

@@ -24,6 +24,7 @@ from vn_nav.report.chart import Series, Shape, legend, panel, to_svg
 from vn_nav.report.page import cards, page, table
 
 BANDS = ((0.1, 0.25), (0.25, 0.5), (0.5, 0.75), (0.75, 1.01))  # shares of the goal picture
+DISTANCES = (0.0, 0.6, 1.5, 3.0, 6.0)  # m
 THRESHOLDS = (0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 FALSE_RATES = (0.01, 0.02, 0.05, 0.1)
 WIDTH, HEIGHT = 520.0, 420.0  # of a chart [pixels]
@@ -161,22 +162,25 @@ def _thresholds(judged: Judged) -> str:
 
 
 def _errors(judged: Judged) -> str:
-    """Errors of the pose by overlap."""
+    """Errors of the pose by overlap, and by distance where in view."""
     lines = []
-    for low, high in BANDS:
-        own = in_band(judged.overlap, (low, high))
+    kinds = [*((f'{low:.0%} to {min(high, 1):.0%} in view', in_band(judged.overlap, (low, high)))
+               for low, high in BANDS),
+             *((f'{near:g} to {far:g} m away', judged.sees & in_band(judged.distance, (near, far)))
+               for near, far in zip(DISTANCES, DISTANCES[1:], strict=False))]
+    for name, own in kinds:
         far = own & (judged.distance > 0.3)
         if not own.any():
             continue
         lines.append([
-            f'{low:.0%} to {min(high, 1):.0%}', f'{own.sum():,}',
+            name, f'{own.sum():,}',
             f'{np.median(judged.distance[own]):.2f}',
             *(f'{np.percentile(judged.position_error[own], share):.2f}' for share in (50, 80)),
             f'{math.degrees(np.median(judged.bearing_error[far])):.0f}' if far.any() else '',
             *(f'{math.degrees(np.percentile(judged.heading_error[own], share)):.0f}'
               for share in (50, 80)),
             _share(judged.position_error[own] <= HALF_RADIUS * judged.position_scale[own])])
-    return table(['In view', 'pairs', 'distance m (median)', 'position m (median)', '(80 %)',
+    return table(['', 'pairs', 'distance m (median)', 'position m (median)', '(80 %)',
                   'bearing deg (median)', 'heading deg (median)', '(80 %)', 'half circle'], lines)
 
 
