@@ -10,7 +10,7 @@ from vn_nav.cli.train import add_train_options, train_config
 from vn_nav.errors import UserError
 from vn_nav.learning.learner_config import TASKS
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
-from vn_nav.robot import DRIVE_ACTIONS
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 # Thesis, table 5.1, in its order; the actor's weight is 1 by the form of the loss, RMSprop's
 # alpha is the optimiser's (test_learner.py holds both against formulas).
@@ -107,7 +107,9 @@ def test_only_a_replayed_task_of_ours_is_off_in_the_thesis():
 def test_every_preset_names_itself_and_makes_its_network(name):
     config = preset(name)
     assert config.preset == name and set(ENVIRONMENT[name]) >= {'envs', 'max_decisions'}
-    network = config.network(DRIVE_ACTIONS, 84)
+    own = {} if name != 'search' else {
+        'moves': RobotSpec().with_actions(DRIVE_ACTIONS).moves, 'view': 1.5, 'footprint': 0.2}
+    network = config.network(DRIVE_ACTIONS, 84, **own)
     assert network.heads == config.heads and network.actions == DRIVE_ACTIONS
 
 

@@ -63,7 +63,7 @@ def test_slips_are_cut_off_and_the_other_bar_earns_nothing():
 
 
 def test_no_preset_is_left_out():
-    assert set(BUDGETS) == set(PRESETS)
+    assert set(BUDGETS) == set(PRESETS) - {'search'}  # it drives nowhere: supervised
 
 
 def stop_when_learned(row):

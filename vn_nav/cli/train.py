@@ -18,6 +18,7 @@ from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, TrainConfig, preset
 from vn_nav.learning.pretrain_job import load_bags, print_line
 from vn_nav.learning.trainer import train
+from vn_nav.policy.network_config import SEARCH
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_nav.scenes import one_simulator
 
@@ -154,12 +155,16 @@ def world_options(args: argparse.Namespace) -> dict:
 def run(args: argparse.Namespace) -> int:
     """`vn_nav train`."""
     check_backend(args.backend)
+    config = train_config(args)
+    if config.architecture == SEARCH:
+        from vn_nav.cli import sight
+        return sight.run(args, config)
     _check(args)
     if args.env == 'ros':
         return _over_ros(args)
     from vn_sim_bridge.navigation.env_config import PRIVILEGED
     scenes = training_scenes(args)
-    config, world = train_config(args), world_options(args)
+    world = world_options(args)
     # The preset's wishes, where nobody else has any.
     optional = [name for name in ('progress_reward', 'exploration_reward')
                 if getattr(args, name) is None]

@@ -12,6 +12,7 @@ starts from it; every number can be changed from the command line.
 | `icra2017` | Zhu et al. 2017: frozen features of four pictures, siamese layers, layers of its own for each scene; 10 at the goal, -0.01 a step (sections IV-B and IV-C) |
 | `fast` | PPO, early fusion, GAE, Adam, success-driven curriculum; goal poses, learned from picture pairs first |
 | `anywhere` | `fast` for houses that no training saw: a correlation volume, the goal tracked, a teacher that explores (docs/results.md) |
+| `search` | the networks of a policy that searches any house with a map: supervised on picture pairs, nobody drives (`vn_nav.learning.sight_training`); frames are pairs |
 """  # noqa: E501
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from vn_nav.labels import CLASSES
 from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.encoders import LARGE_LAYOUT_PX
-from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.network_config import SEARCH, NetworkConfig
 
 
 def _is_finite(value) -> bool:
@@ -148,13 +149,15 @@ class TrainConfig(LearnerConfig):
 
     def network(self, actions: tuple[str, ...], size: int,
                 moves: tuple[tuple[float, float, float], ...] = (),
-                classes: int = CLASSES) -> NetworkConfig:
+                classes: int = CLASSES, *, view: float = 0.0, footprint: float = 0.0
+                ) -> NetworkConfig:
         """The network for a robot's actions and a picture size, with the heads of the tasks.
 
         Args:
             actions: names; size: side of the pictures [pixels].
             moves: what the actions do, see `NetworkConfig.moves`; for `track_goal` alone.
             classes: of the labels that segmentation heads draw.
+            view, footprint: of the robot, see `NetworkConfig`; for the architecture search.
         """
         deconvolutions = self.deconvolutions or (1 if size < LARGE_LAYOUT_PX else 2)
         heads = dict.fromkeys((*self.heads, *self.extra_heads))
@@ -167,7 +170,7 @@ class TrainConfig(LearnerConfig):
             moves=moves if self.track_goal else (),
             action_filter='' if self.action_filter else NONE, pixel_mean=self.pixel_mean,
             pixel_std=self.pixel_std, frozen=self._frozen,
-            scenes=self.scenes)
+            scenes=self.scenes, view=view, footprint=footprint)
 
 
 _A2C = {
@@ -205,6 +208,11 @@ PRESETS: dict[str, dict] = {
         'imitation': 1.0, 'imitation_until': 0.75, 'teacher_share': 0.8, 'teacher_until': 0.5,
         'start_difficulty': 1.0, 'pair_minutes': 16.0, 'pair_houses': 384, 'frames': 4_200_000,
     },
+    SEARCH: {
+        'architecture': SEARCH, 'track_goal': True, 'channels': (32, 64, 32), 'blocks': 2,
+        'features': 512, 'learning_rate': 8e-4, 'final_learning_rate': 2e-5,
+        'max_gradient_norm': 2.0, 'pair_houses': 512, 'frames': 4_000_000,
+    },
 }
 _THESIS_ENVIRONMENT = {'envs': 16, 'max_decisions': 900, 'progress_reward': 0.0,
                        'collision_reward': 0.0}
@@ -234,6 +242,17 @@ def preset(name: str, /, **changes) -> TrainConfig:
                             'correct the name')
     changes = {key: _value(key, value, known[key]) for key, value in changes.items()}
     return TrainConfig(**{**PRESETS[name], 'preset': name, **changes})
+
+
+def check_not_search(architecture: str, received: object) -> None:
+    """Refuse the networks of search where a policy is to drive or remember while it learns.
+
+    Raises:
+        UserError: naming what was received.
+    """
+    if architecture == SEARCH:
+        raise UserError('a policy of the architecture search has no actor and no memory to teach',
+                        received, 'train its networks with vn_nav train --preset search')
 
 
 def _value(name: str, value, kind):

@@ -22,7 +22,7 @@ from vn_nav.errors import UserError
 from vn_nav.labels import CLASSES
 from vn_nav.learning.hindsight import Drives, Split, rows_of, split
 from vn_nav.learning.precision import fast_dtype
-from vn_nav.learning.presets import TrainConfig, preset
+from vn_nav.learning.presets import TrainConfig, check_not_search, preset
 from vn_nav.learning.pretrain_config import PretrainConfig, choose_parts
 from vn_nav.learning.pretraining import pretrain_network
 from vn_nav.learning.supervised import PARTS
@@ -152,6 +152,7 @@ def _train_config(job: PretrainJob, given: LoadedCheckpoint | None) -> TrainConf
     name = job.preset or (given.info['preset'] if given else '') or 'fast'
     train = preset(name, **{'seed': job.numbers.seed, 'threads': job.threads,
                             'device': job.device, **job.changes})
+    check_not_search(train.architecture, f'the preset {name}')
     if train.architecture == 'icra2017':
         raise UserError('an encoder that learns is pre-trained',
                         'the architecture icra2017, whose encoder is frozen',
@@ -174,6 +175,7 @@ def _robot_and_network(job: PretrainJob, given: LoadedCheckpoint | None,
         if asked is not None and asked != own:
             raise UserError(f'{option} is that of the checkpoint of --init: {own}', asked,
                             f'leave {option} out, or --init')
+    check_not_search(network.architecture, job.init)
     if network.architecture == 'icra2017':
         raise UserError('an encoder that learns is pre-trained', f'{job.init}, whose encoder is '
                         'frozen', 'choose another --init')

@@ -9,7 +9,7 @@ from typing import Any
 
 from vn_nav.bags.mapping.recorded_place import PlaceOptions
 from vn_nav.errors import UserError
-from vn_nav.learning.presets import ENVIRONMENT, TrainConfig, preset
+from vn_nav.learning.presets import ENVIRONMENT, TrainConfig, check_not_search, preset
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.robot import RobotSpec
@@ -89,6 +89,7 @@ def numbers(job: TeachJob, given: LoadedCheckpoint | None, minutes: float,
                                                    minutes / 3)}
     else:
         network = given.config
+        check_not_search(network.architecture, job.checkpoint)
         if network.architecture == 'icra2017':
             raise UserError('an encoder that learns is taught', f'{job.checkpoint}, whose '
                             'encoder is frozen', 'choose another --checkpoint')

@@ -25,7 +25,7 @@ from vn_nav.learning.learner_config import TASKS, TEACHERS
 from vn_nav.learning.log import Log
 from vn_nav.learning.pairs import PairConfig, PairSource, pretrain_pairs
 from vn_nav.learning.precision import fast_dtype
-from vn_nav.learning.presets import GIVEN, TrainConfig
+from vn_nav.learning.presets import GIVEN, TrainConfig, check_not_search
 from vn_nav.learning.replay import Replay
 from vn_nav.learning.rollout import Collector, Episode, Rollout
 from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
@@ -57,6 +57,7 @@ class Training:
             settle_labels(env, bags)
             config = dataclasses.replace(config, extra_heads=(*config.extra_heads, *bags.heads))
         self.bags, self.columns = bags, COLUMNS + (() if bags is None else bags.columns)
+        check_not_search(config.architecture, f'the preset {config.preset}')
         self.env, self.config, self.folder, self.processes = env, config, folder, processes
         self.info = {**info, 'seed': config.seed, 'world_version': env.world_version}
         size = env.goals.shape[-1]

@@ -30,14 +30,15 @@ CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
 # last angle is that of the robot's place off the line behind the goal. The rest stands anywhere.
 BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
 GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
-# The mixture `RECOGNITION` is for telling the goal from what is nearly it. Shares, the rest of one
-# of the three stands anywhere in the place; distances [m] and headings off the goal's [rad] are
-# drawn between two limits.
+# The mixture `RECOGNITION` is for telling the goal from what is nearly it: about a third there or
+# where the goal is likely seen, a third nearly there, a third elsewhere. Shares (the rest of one
+# stands anywhere in the place); distances [m] and headings off the goal's [rad], each drawn
+# between two limits. The ring shows the goal from near, so that most of the first third is far.
 MIXES = USUAL, RECOGNITION = 'usual', 'recognition'
-THERE = (0.15, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
-SEEN = 0.19  # and as `NEARBY` and `BEHIND`, in equal parts: a third in all
-BESIDE = (0.17, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
-ASKEW = (0.16, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew: a third in all
+THERE = (0.12, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
+SEEN = 0.25  # and as `NEARBY` and `BEHIND`, in equal parts
+BESIDE = (0.15, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
+ASKEW = (0.14, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew
 TURNED = (0.17, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
 TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
 WINDOW = 12  # cells around a goal that a path of the arrival radius cannot leave
@@ -58,9 +59,9 @@ class PairSampler:
         randomisation: of light and camera; default: nothing varies.
         seed: of the draws.
         threads: threads that draw.
-        mix: of `MIXES`, how robots stand about goals: 'usual' as above, or 'recognition': a third
-            there or where the goal is likely seen, a third nearly there (`BESIDE`, `ASKEW`), a
-            third in the same room turned away (`TURNED`) or anywhere.
+        mix: of `MIXES`, how robots stand about goals: 'usual' as above, or 'recognition': about a
+            third there or where the goal is likely seen, a third nearly there (`BESIDE`,
+            `ASKEW`), a third in the same room turned away (`TURNED`) or anywhere.
 
     Raises:
         UserError: no scene, an unknown mix, or a simulator that cannot look from anywhere.
