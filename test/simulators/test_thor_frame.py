@@ -14,6 +14,7 @@ from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.meshes.procthor import house_surfaces
 from vn_sim_bridge.meshes.vocabulary import Vocabulary
 from vn_sim_bridge.simulator import Setup
+from vn_sim_bridge.simulators.house import HouseSimulator
 from vn_sim_bridge.simulators.thor import SIMULATOR
 from vn_sim_bridge.thor.frame import (
     TO_MAP,
@@ -83,6 +84,11 @@ def test_a_house_of_procthor_has_one_map_in_both_simulators():
     assert np.allclose([point_to_ours(dict(zip('xyz', p, strict=True))) for p in points], ours)
     assert np.allclose(points_to_thor(ours), points)
     assert np.linalg.det(TO_MAP) == pytest.approx(-1), 'a left-handed frame becomes right-handed'
+
+
+def test_turns_are_exact_there():
+    """Thesis, section 5.6: noise along the motion alone (what it does: `test_corridor`)."""
+    assert SIMULATOR.exact_turns and not HouseSimulator.exact_turns
 
 
 def test_the_camera_looks_no_farther_than_the_agent_can():
