@@ -159,6 +159,7 @@ def test_many_houses_in_a_file(tmp_path):
                         if label == 'bed']) / 2 for place in simulator.places]
     assert np.allclose(middles, [5.5, 6, 6.5], atol=.02)
     for options, rule in (('', 'needs index'), ('?index=9', 'smaller index'),
+                          ('?index=0-9', 'smaller index'),  # not when a robot gets there
                           ('?index=3-1', 'FIRST-LAST'), ('?index=a', 'needs index'),
                           ('?index=1&doors=ajar', 'open or as_given'),
                           ('?index=1&meshes=none', 'option meshes'),
