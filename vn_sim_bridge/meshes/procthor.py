@@ -5,6 +5,7 @@ Unity's frame becomes the map's by `thor.frame`, as in the simulator `thor`: one
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Iterator
@@ -284,7 +285,7 @@ def _post(wall: Wall, start: float, end: float, low: float, high: float,
     matrix[2, 2] = (high - low) / 2
     matrix[:2, 3] = wall.first + (start + end) / 2 * wall.along
     matrix[2, 3] = (low + high) / 2
-    return _cube() @ matrix[:3, :3].T + matrix[:3, 3]
+    return CUBE @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _cube() -> np.ndarray:
@@ -297,6 +298,9 @@ def _cube() -> np.ndarray:
                                 for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
             found += [corners[[0, 1, 2]], corners[[0, 2, 3]]]
     return np.array(found)
+
+
+CUBE = _cube()
 
 
 def _objects(house: dict, vocabulary: Vocabulary, boxes: dict, meshes: Path | None, name: str,
@@ -327,7 +331,7 @@ def _objects(house: dict, vocabulary: Vocabulary, boxes: dict, meshes: Path | No
             continue
         guessed += asset not in boxes
         size = np.array(boxes.get(asset, SIZES.get(_type(entry), UNKNOWN)))
-        corners = (_cube() * (size / 2)) @ (TO_MAP @ turn).T + TO_MAP @ position
+        corners = (CUBE * (size / 2)) @ (TO_MAP @ turn).T + TO_MAP @ position
         surfaces.append(Surface(corners[:, ::-1], None, _tint(_type(entry)), None, label, number))
     if drawn[False]:
         say_once(f'{name}: {drawn[False]} of {sum(drawn.values())} objects are labelled boxes, '
@@ -358,10 +362,13 @@ def _type(entry: dict) -> str:
     return str(entry.get('objectType') or str(entry.get('id', '')).split('|')[0])
 
 
+@functools.lru_cache(4096)
 def _tint(kind: str) -> np.ndarray:
     """A colour of a type, the same in every house."""
     rng = np.random.default_rng(list(kind.encode()))
-    return 0.25 + 0.65 * rng.random(3)
+    found = 0.25 + 0.65 * rng.random(3)
+    found.setflags(write=False)  # it is shared
+    return found
 
 
 def _colour(material: Any) -> np.ndarray:
