@@ -67,8 +67,9 @@ def measure(name: str, envs: int, seconds: float) -> dict:
     while (spent := time.perf_counter() - begun) < seconds:
         env.step(actions[count % 1000])
         count += 1
-    found = {'told': ('rgb', *env.config.privileged), 'steps/s': count * envs / spent, 'open s': opened,
-             'reset ms': 1000 * float(np.median(resets)) / envs, 'MB': memory_mb()}
+    found = {'told': ('rgb', *env.config.privileged), 'steps/s': count * envs / spent,
+             'open s': opened, 'reset ms': 1000 * float(np.median(resets)) / envs,
+             'MB': memory_mb()}
     env.close()
     return found
 

@@ -8,7 +8,7 @@ configurations, checkpoints, figures and parameters; two names of one scene are 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from vn_nav.errors import UserError
@@ -16,6 +16,24 @@ from vn_nav.errors import UserError
 HOUSE, BAG = 'house', 'bag'  # the simulators that other parts know by name
 ROOMS = 5  # of a house that is named without them
 EXAMPLE = 'name it as in house:7, house:7?rooms=3 or bag:my_drive'
+# What options mean where a name leaves them out, by simulator or by its place ('*/*': places with
+# a slash). A simulator whose defaults stand here has one name for a scene, with them or without.
+DEFAULTS: Mapping[str, Mapping[str, str]] = {
+    HOUSE: {'rooms': str(ROOMS)},
+    'dmlab:arena': {'apples': '8', 'lemons': '8', 'decisions': '300'},
+    'dmlab:maze': {'seed': '0', 'size': '7'},
+    'dmlab:*/*': {'seed': '0'},
+    'gltf': {'doors': 'as_drawn', 'height': '1.2', 'scale': '1', 'up': 'y'},
+    'grid': {'distances': 'file'},
+    'house3d': {'device': '0', 'labels': 'coarse'},
+    'procthor': {'doors': 'open'},
+    'suncg': {'depth': 'metres', 'labels': 'nyu40', 'level': '0', 'obstacles': 'mesh',
+              'targets': 'house3d'},
+    'thor': {'moves': 'bisect', 'objects': 'still'},
+}
+# Options that are whole numbers there: 03 is 3. (Names of places and files are left as they are.)
+NUMBERS = {'apples', 'decisions', 'device', 'index', 'lemons', 'level', 'rooms', 'seed', 'size',
+           'storey'}
 _SIMULATOR = re.compile(r'[A-Za-z_]\w*(\.[A-Za-z_]\w*)*')
 _OPTION = re.compile(r'([a-z_]+)=([^&=?]+)')
 
@@ -51,10 +69,36 @@ def parse_scene(text: str) -> SceneName:
         if not found or found[1] in dict(pairs):
             raise UserError(rule, text, EXAMPLE)
         pairs.append((found[1], found[2]))
-    if simulator == HOUSE:  # two names of one scene are never different
-        place = str(int(place)) if re.fullmatch(r'\d{1,18}', place) else place
-        pairs = [pair for pair in pairs if pair != ('rooms', str(ROOMS))]
+    # Two names of one scene are never different.
+    if simulator == HOUSE:
+        place = _plain(place)
+    if simulator in {name.partition(':')[0] for name in DEFAULTS}:
+        defaults = defaults_of(simulator, place)
+        pairs = [(key, _plain(value) if key in NUMBERS else value) for key, value in pairs
+                 if not _same(value, defaults.get(key))]
     return SceneName(simulator, place, tuple(sorted(pairs)))
+
+
+def defaults_of(simulator: str, place: str) -> Mapping[str, str]:
+    """What the options of a place mean where its name leaves them out; see `DEFAULTS`."""
+    for name in (f'{simulator}:{place}', f'{simulator}:*/*' if '/' in place else '', simulator):
+        if name in DEFAULTS:
+            return DEFAULTS[name]
+    return {}
+
+
+def _plain(number: str) -> str:
+    """A whole number without leading zeros; other text as it is."""
+    return str(int(number)) if re.fullmatch(r'\d{1,18}', number) else number
+
+
+def _same(value: str, default: str | None) -> bool:
+    """Whether a value is the default, as text or as a number."""
+    if value == default or default is None:
+        return value == default
+    decimal = r'\d{1,18}(\.\d{1,18})?'
+    return bool(re.fullmatch(decimal, value) and re.fullmatch(decimal, default)
+                and float(value) == float(default))
 
 
 def scene_name(text: str) -> str:

@@ -183,6 +183,7 @@ class Simulator(Protocol):
     objects: Objects
     planner: Planner | None  # None: a robot can turn anywhere, so distances will do
     room_objects: Mapping[str, Sequence[str]] | None  # see `BaseSimulator`
+    exact_turns: bool  # motion noise is along translations alone
 
     @property
     def label_names(self) -> Sequence[str]:
@@ -307,6 +308,7 @@ class BaseSimulator(abc.ABC):
     room_objects: Mapping[str, Sequence[str]] | None = None
     splits: ClassVar[Mapping[str, Sequence[str]]] = {}  # names of scenes by the split's name
     planner: Planner | None = None
+    exact_turns: bool = False  # else 2 deg of motion noise on rotations, `floor.contacts`
     places: Sequence[Place]
 
     @classmethod

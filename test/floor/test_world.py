@@ -94,6 +94,8 @@ def test_noise_adds_up_to_the_same_variance_in_ticks(ticks):
     turn = np.tile([0, 0, 0.5, 0], (4000, 1))
     noisy = motion_noise(turn, np.full(4000, 0.5), rng.standard_normal(4000))
     assert noisy[:, 2].std() == pytest.approx(ROTATION_NOISE, rel=0.06)
+    exact = motion_noise(turn, np.full(4000, 0.5), rng.standard_normal(4000), exact_turns=True)
+    assert np.array_equal(exact, turn)
     assert np.array_equal(motion_noise(np.array([[0, 0, 0, 0.5]]), np.ones(1), np.ones(1)),
                           [[0, 0, 0, 0.5]])
 

@@ -285,6 +285,39 @@ def test_the_table_imports_nothing_before_it_is_asked():
     assert done.stdout.strip() == '[]', done.stderr
 
 
+class ExactTurns(BASE):
+    exact_turns = True
+
+
+@pytest.mark.parametrize('kind', [BASE, ExactTurns])
+def test_a_simulator_says_whether_motion_noise_is_on_turns(kind, monkeypatch):
+    env = make(kind, actions=ROBOT.action_names)
+    env.reset(seed=0)
+    before = env.simulator.poses.copy()
+    env.step(np.full(4, ROBOT.action_names.index('rotate_left')))
+    turned = env.simulator.poses[:, 2] - before[:, 2]
+    wanted = next(a.dyaw for a in ROBOT.actions if a.name == 'rotate_left')
+    off = np.abs(np.sin((turned - wanted) / 2))
+    assert (off < 1e-12).all() if kind.exact_turns else (off > 1e-5).all()
+    before = env.simulator.poses.copy()
+    _, _, _, _, info = env.step(np.full(4, ROBOT.action_names.index('backward')))
+    gone = np.hypot(*(env.simulator.poses - before)[:, :2].T)
+    free = ~info['collided']
+    assert free.any() and (np.abs(gone[free] - 0.2) > 1e-6).all(), 'translations have it'
+    env.close()
+    # A robot that is driven by velocities likewise, and its odometry expects no other error.
+    monkeypatch.setattr(corridor, 'SIMULATOR', kind)
+    robot = SimulatedRobot(SCENE, robot=RobotSpec(), size=24, noise=True, seed=1)
+    robot.begin_episode(0)
+    for _ in range(20):
+        robot.tick(np.array([0.0, 0.0, 0.5, 0.0]))
+    drift = abs(float(np.sin((robot.pose[2] - robot.odometry[2]
+                              - robot.episode.start[2]) / 2)))
+    assert drift < 1e-9 if kind.exact_turns else drift > 1e-4
+    assert (robot.uncertainty.pose[2, 2] < 1e-7) == kind.exact_turns
+    robot.close()
+
+
 def test_every_capability_is_read():
     sources = [path.read_text() for folder in ('navigation', 'robot', '.')
                for path in (ROOT / 'vn_sim_bridge' / folder).glob('*.py')]

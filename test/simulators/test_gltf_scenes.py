@@ -202,6 +202,46 @@ def test_a_pattern_means_several_scenes(tmp_path):
         opened(f'gltf:{path}?scene=home_1&up=z')
 
 
+def annotate(path, *categories):
+    """Semantic files beside a stage, all of whose (white) surfaces are of the first category."""
+    path.with_suffix('.semantic.glb').write_bytes(path.read_bytes())
+    path.with_suffix('.semantic.txt').write_text('HM3D Semantic Annotations\n' + ''.join(
+        f'{k},{0xFFFFFF - k:06X},"{name}",0\n' for k, name in enumerate(categories)))
+    return path
+
+
+def test_a_class_has_one_number_whoever_else_is_open(tmp_path):
+    """Of a data set with a table, semantic ids and a semantic file, each in another scene."""
+    path = write_dataset(tmp_path)
+    room = tmp_path / 'stages/annotated.glb'
+    write_room(room)
+    annotate(room, 'zither', 'abacus')
+    (tmp_path / 'stages/annotated.stage_config.json').write_text(json.dumps(
+        {'render_asset': 'annotated.glb'}))
+    (tmp_path / 'scenes/home_0.scene_instance.json').write_text(json.dumps(
+        {'stage_instance': {'template_name': 'stages/annotated'}}))
+    described = tmp_path / 'semantics/scenes/home_1.semantic_config.json'
+    described.write_text(json.dumps({**json.loads(described.read_text()),
+                                     'classes': [{'id': 7, 'name': 'banjo'}]}))
+    alone = [opened(f'gltf:{path}?scene=home_{k}').label_names for k in range(3)]
+    together = opened(f'gltf:{path}?scene=home_*', num_envs=3).label_names
+    assert alone == [together] * 3
+    assert together == (*LABELS, 'abacus', 'banjo', 'chest_of_things', 'zither')
+
+
+def test_files_with_classes_of_their_own_need_one_list_to_be_opened_together(tmp_path):
+    first, second, plain = (write_room(tmp_path / f'{name}.glb') for name in 'abc')
+    annotate(first, 'zither')
+    annotate(second, 'abacus')
+    assert opened(f'gltf:{plain}', f'gltf:{first}').label_names == (*LABELS, 'zither')
+    with pytest.raises(UserError, match='alike.*a.glb.*labels=FILE'):
+        opened(f'gltf:{first}', f'gltf:{plain}', f'gltf:{second}')
+    (tmp_path / 'labels.json').write_text('{"labels": ["abacus", "zither"]}')
+    options = f'?labels={tmp_path}/labels.json'
+    assert opened(f'gltf:{first}{options}', f'gltf:{second}{options}', num_envs=2).label_names == (
+        *LABELS, 'abacus', 'zither')
+
+
 @pytest.mark.parametrize(('change', 'rule'), [
     (lambda root: (root / 'stages/shell.glb').unlink(), 'shell.glb'),
     (lambda root: (root / 'objects/a17.object_config.json').unlink(), 'a17'),

@@ -8,6 +8,7 @@ from conformance import ROBOT, SIZE, Conformance
 from mesh_places import FLOOR, TABLE, WALL, box, flat, house_surfaces, room_surfaces, surface
 
 from vn_nav.errors import UserError
+from vn_nav.robot import DRIVE_ACTIONS
 from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.houses.labels import LABELS
@@ -15,6 +16,8 @@ from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.meshes.place import PlaceRules, RoomOutline, make_place
 from vn_sim_bridge.meshes.semantics import split_large
 from vn_sim_bridge.meshes.simulator import MeshSimulator
+from vn_sim_bridge.navigation.env import NavigationEnv
+from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.simulator import Placed, Setup
@@ -129,6 +132,19 @@ def test_places_are_read_when_they_are_needed_and_let_go_of():
     assert simulator.cache.loads == loads, 'where robots are nothing is read again'
     simulator.close()
     assert len(simulator.cache) == 0
+
+
+def test_an_environment_reads_each_place_twice_at_most_when_it_is_made():
+    """For goals and floor, and for the pictures of the goals: a split may have large scenes."""
+    simulator = rooms(2, tuple(range(60, 80)), budget=0)
+    env = NavigationEnv(EnvConfig(num_envs=2, size=SIZE, actions=DRIVE_ACTIONS), ROBOT,
+                        simulator=simulator)
+    assert len(env.goals) > 20 and simulator.cache.loads <= 2 * 20
+    loads = simulator.cache.loads
+    for place in simulator.places:
+        assert place.goals and place.rooms and place.floor.free.any()
+    assert simulator.cache.loads == loads
+    env.close()
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from vn_sim_bridge.meshes.procthor import rotation
 from vn_sim_bridge.render.mesh_scene import mesh_scene
 from vn_sim_bridge.simulator import Setup
 from vn_sim_bridge.simulators import open_simulator
+from vn_sim_bridge.thor.frame import pose_to_ours
 
 ASSETS = {'Bed': [{'assetId': 'Bed_1', 'boundingBox': point(1.0, 0.8, 2.0)}],
           'DiningTable': [{'assetId': 'DiningTable_1', 'boundingBox': point(1.0, 0.8, 0.6)}]}
@@ -33,9 +34,20 @@ def written(tmp_path):
     return opened
 
 
-def look(simulator, x, y, yaw, pitch=0.0):
-    """Depth and class in the middle of a picture from a pose."""
-    frames = simulator.view(np.array([0]), np.array([[x, y, yaw, pitch]]))
+def standing(x, z, rotation, horizon=0.0):
+    """The pose of an agent of AI2-THOR, in its own words: m and degrees, clockwise from z."""
+    return pose_to_ours({'position': point(x, 0.9, z), 'rotation': point(0, rotation, 0),
+                         'cameraHorizon': horizon}, 0.0)
+
+
+def rect_in_unity(rect):
+    """x0, z0, x1, z1 of a rectangle of the map."""
+    return -rect[3], rect[0], -rect[1], rect[2]
+
+
+def look(simulator, x, z, rotation, horizon=0.0):
+    """Depth and class in the middle of the picture of an agent of AI2-THOR."""
+    frames = simulator.view(np.array([0]), standing(x, z, rotation, horizon)[None])
     middle = frames.depth.shape[1] // 2
     return float(frames.depth[0, middle, middle]), simulator.label_names[
         frames.labels[0, middle, middle]]
@@ -59,17 +71,20 @@ def test_rooms_walls_doors_and_windows_are_where_the_house_has_them(written):
     (place,) = simulator.places
     assert [(room.name, room.kind) for room in place.rooms] == [('kitchen', 'kitchen'),
                                                                 ('bedroom', 'bedroom')]
-    assert place.rooms[0].rect == pytest.approx((0, 0, 4, 4), abs=.11)
+    # The map's x is Unity's z, its y Unity's -x.
+    assert place.rooms[0].rect == pytest.approx((0, -4, 4, 0), abs=.11)
+    assert place.rooms[1].rect == pytest.approx((0, -8, 4, -4), abs=.11)
     assert {goal.room for goal in place.goals} == {'kitchen', 'bedroom'}
-    # The map's x is Unity's x, its y Unity's z. Along y = 1 the door is open up to the far wall.
-    assert look(simulator, 1.0, 1.0, 0.0) == (pytest.approx(7.0, abs=.01), 'wall')
-    assert look(simulator, 3.0, 3.0, 0.0) == (pytest.approx(1.0, abs=.01), 'wall')
-    assert look(simulator, 5.0, 3.5, np.pi) == (pytest.approx(1.0, abs=.01), 'wall')
-    assert look(simulator, 6.0, 2.5, 0.0, -.2) == (pytest.approx(2 / np.cos(.2), abs=.02),
-                                                   'window')
-    assert look(simulator, 1.0, 2.0, 0.0, 1.0)[1] == 'floor'
-    assert look(simulator, 1.0, 2.0, 0.0, -1.0)[1] == 'ceiling'
-    labels = simulator.view(np.array([0]), np.array([[2.0, 1.0, 0, 0]])).labels
+    # To the right of z, along z = 1, the door is open up to the far wall.
+    assert look(simulator, 1.0, 1.0, 90) == (pytest.approx(7.0, abs=.01), 'wall')
+    assert look(simulator, 3.0, 3.0, 90) == (pytest.approx(1.0, abs=.01), 'wall')
+    assert look(simulator, 5.0, 3.5, 270) == (pytest.approx(1.0, abs=.01), 'wall')
+    assert look(simulator, 5.0, 1.0, 0) == (pytest.approx(3.0, abs=.01), 'wall')
+    assert look(simulator, 6.0, 2.5, 90, -12) == (
+        pytest.approx(2 / np.cos(np.radians(12)), abs=.02), 'window')
+    assert look(simulator, 1.0, 2.0, 90, 57)[1] == 'floor'
+    assert look(simulator, 1.0, 2.0, 90, -57)[1] == 'ceiling'
+    labels = simulator.view(np.array([0]), standing(2.0, 1.0, 90)[None]).labels
     assert simulator.label_names.index('door') in labels, 'its frame'
     assert place.distance_to(place.goals[0]).maximum < 12, 'through the door'
     assert place.floor.free.sum() * 0.01 > 18
@@ -77,17 +92,17 @@ def test_rooms_walls_doors_and_windows_are_where_the_house_has_them(written):
 
 def test_a_robot_drives_through_the_door_and_not_through_walls(written):
     simulator = written(num_envs=2)
-    simulator.place(np.arange(2), np.array([[3.0, 1.0, 0, 0], [3.0, 3.0, 0, 0]]))
+    simulator.place(np.arange(2), np.array([standing(3, 1, 90), standing(3, 3, 90)]))
     for _ in range(4):
         motion = simulator.move(np.array([[0.5, 0, 0, 0]] * 2))
-    assert not motion.collided[0] and simulator.poses[0, 0] == pytest.approx(5.0)
+    assert not motion.collided[0] and simulator.poses[0, 1] == pytest.approx(-5.0)
     assert motion.collided[1]
-    assert simulator.poses[1, 0] == pytest.approx(4 - ROBOT.footprint_radius, abs=.01)
+    assert simulator.poses[1, 1] == pytest.approx(ROBOT.footprint_radius - 4, abs=.02)
 
 
 def test_doors_that_are_shut_are_shut_if_told_so(written):
     simulator = written(options='&doors=as_given')
-    assert look(simulator, 1.0, 1.0, 0.0) == (pytest.approx(3.0, abs=.05), 'door')
+    assert look(simulator, 1.0, 1.0, 90) == (pytest.approx(3.0, abs=.05), 'door')
     assert simulator.places[0].floor.free.sum() * 0.01 < 13, 'one room'
 
 
@@ -95,11 +110,11 @@ def test_objects_are_labelled_boxes_of_their_sizes_and_it_says_so(written, capsy
     simulator = written()
     assert '4 of 4 objects are labelled boxes, 2 of them of the usual size' in (
         capsys.readouterr().err)
-    # A bed of 1 m x 2 m, turned by 90 degrees, stands across: x from 6 to 8, y from 2.5 to 3.5.
+    # A bed of 1 m x 2 m, turned by 90 degrees, stands across: x from 6 to 8, z from 2.5 to 3.5.
     rect = next(rect for rect, label in simulator.places[0].obstacles if label == 'bed')
-    assert np.allclose(rect, (6, 2.5, 8, 3.5), atol=.02)
-    assert look(simulator, 4.6, 3.0, 0.0, .35)[1] == 'bed'
-    shown = simulator.view(np.array([0]), np.array([[0.6, 2.5, 0, .2]])).labels
+    assert np.allclose(rect_in_unity(rect), (6, 2.5, 8, 3.5), atol=.025)
+    assert look(simulator, 4.6, 3.0, 90, 20)[1] == 'bed'
+    shown = simulator.view(np.array([0]), standing(0.6, 2.5, 90, 11)[None]).labels
     names = {simulator.label_names[k] for k in np.unique(shown)}
     assert {'table', 'mug'} <= names, 'what stands on it as well'
 
@@ -121,12 +136,13 @@ def test_meshes_of_a_folder_take_the_place_of_boxes(written, capsys):
     house = small_house(objects=[thing('Bed', 1, 6, .25, 3)])
     simulator = written(house, f'&meshes={folder}')
     assert 'labelled boxes' not in capsys.readouterr().err
-    rects = [rect for rect, label in simulator.places[0].obstacles if label == 'bed']
+    rects = np.array([rect_in_unity(rect) for rect, label in simulator.places[0].obstacles
+                      if label == 'bed'])
     low, high = np.min(rects, axis=0)[:2], np.max(rects, axis=0)[2:]
     assert np.allclose((*low, *high), (5, 2.5, 7, 3.5), atol=.02), 'by its middle'
-    # The file's x is Unity's -x: the short leg is at the map's greater x.
-    inside = [any(r.x0 <= x <= r.x1 and r.y0 <= y <= r.y1 for r in rects)
-              for x, y in ((6.8, 2.7), (5.2, 2.7), (6.8, 3.3), (5.2, 3.3))]
+    # The file's x is Unity's -x: the short leg is at the greater x.
+    inside = [any(x0 <= x <= x1 and z0 <= z <= z1 for x0, z0, x1, z1 in rects)
+              for x, z in ((6.8, 2.7), (5.2, 2.7), (6.8, 3.3), (5.2, 3.3))]
     assert inside == [True, False, True, True]
 
 
@@ -139,10 +155,11 @@ def test_many_houses_in_a_file(tmp_path):
     simulator = open_simulator([f'procthor:{path}?index=1-3'], Setup(1, ROBOT, SIZE))
     assert [place.name[-1] for place in simulator.places] == ['1', '2', '3']
     assert simulator.cache.loads == 1
-    middles = [np.mean([rect[0] + rect[2] for rect, label in place.obstacles
+    middles = [np.mean([-rect[1] - rect[3] for rect, label in place.obstacles
                         if label == 'bed']) / 2 for place in simulator.places]
     assert np.allclose(middles, [5.5, 6, 6.5], atol=.02)
     for options, rule in (('', 'needs index'), ('?index=9', 'smaller index'),
+                          ('?index=0-9', 'smaller index'),  # not when a robot gets there
                           ('?index=3-1', 'FIRST-LAST'), ('?index=a', 'needs index'),
                           ('?index=1&doors=ajar', 'open or as_given'),
                           ('?index=1&meshes=none', 'option meshes'),

@@ -4,15 +4,27 @@ import math
 
 import numpy as np
 import pytest
+from procthor_houses import small_house, thing
 
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import parse_scene
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.houses.labels import LABELS
+from vn_sim_bridge.meshes.procthor import house_surfaces
+from vn_sim_bridge.meshes.vocabulary import Vocabulary
 from vn_sim_bridge.simulator import Setup
+from vn_sim_bridge.simulators.house import HouseSimulator
 from vn_sim_bridge.simulators.thor import SIMULATOR
-from vn_sim_bridge.thor.frame import point_to_ours, point_to_thor, pose_to_ours, pose_to_thor
+from vn_sim_bridge.thor.frame import (
+    TO_MAP,
+    point_to_ours,
+    point_to_thor,
+    points_to_ours,
+    points_to_thor,
+    pose_to_ours,
+    pose_to_thor,
+)
 from vn_sim_bridge.thor.names import LABEL_NAMES, SPLITS, class_of, scene_names
 from vn_sim_bridge.thor.place import floor_of
 
@@ -48,6 +60,35 @@ def test_what_is_right_of_it_in_unity_is_right_of_it_here():
         assert math.isclose(math.sin(turned[2] - start[2]), -math.sin(math.radians(10)))
     assert pose_to_ours(agent(0, 0, 0, horizon=30), 0.0)[3] == pytest.approx(math.radians(30))
     assert point_to_ours({'x': 0.0, 'y': 1.5, 'z': 0.0}) == (0.0, 0.0, 1.5)  # up is up
+
+
+def test_a_house_of_procthor_has_one_map_in_both_simulators():
+    """Corners, objects and headings: `thor` asks the engine for them, `procthor` the file."""
+    house = small_house(objects=[thing('Bed', 1, 7, .4, 3, 30)])
+    made = house_surfaces(house, Vocabulary(), 'house', boxes={'Bed_1': (1.0, 0.8, 2.0)},
+                          meshes=None, doors_as_given=False)
+    for room, entry in zip(made.rooms, house['rooms'], strict=True):
+        there = [point_to_ours(corner)[:2] for corner in entry['floorPolygon']]
+        assert np.allclose(room.polygons[0], there)
+    # The bed lies as an agent that stands and is turned as it is: 2 m ahead, 1 m across.
+    bed = house['objects'][0]
+    at = pose_to_ours({'position': bed['position'], 'rotation': bed['rotation'],
+                       'cameraHorizon': 0.0}, 0.0)
+    (corners,) = [surface.corners.reshape(-1, 3) for surface in made.surfaces
+                  if surface.label == Vocabulary().id('bed')]
+    c, s = math.cos(at[2]), math.sin(at[2])
+    own = (corners[:, :2] - at[:2]) @ [[c, -s], [s, c]]  # ahead and left of it
+    assert np.allclose([np.ptp(own, axis=0), own.min(axis=0)], [(2.0, 1.0), (-1.0, -0.5)])
+    points = np.random.default_rng(0).uniform(-5, 5, (9, 3))
+    ours = points_to_ours(points)
+    assert np.allclose([point_to_ours(dict(zip('xyz', p, strict=True))) for p in points], ours)
+    assert np.allclose(points_to_thor(ours), points)
+    assert np.linalg.det(TO_MAP) == pytest.approx(-1), 'a left-handed frame becomes right-handed'
+
+
+def test_turns_are_exact_there():
+    """Thesis, section 5.6: noise along the motion alone (what it does: `test_corridor`)."""
+    assert SIMULATOR.exact_turns and not HouseSimulator.exact_turns
 
 
 def test_the_camera_looks_no_farther_than_the_agent_can():

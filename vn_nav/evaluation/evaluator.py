@@ -9,6 +9,7 @@ import numpy as np
 
 from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
@@ -209,7 +210,7 @@ def make_actors(env, network: Policy, decoding: str, controls: Sequence[str], th
         return PolicyActor(env, network, rule, seed, threshold, known)
 
     rows = {f'right goal, {decoding}': (policy(), 'right')}
-    if OTHER in controls:
+    if OTHER in controls and network.config.architecture != SEARCH:  # which draws no lots
         other = 'greedy' if decoding == 'sample' else 'sample'
         rows[f'right goal, {other}'] = policy(other), 'right'
     for name, shown in ((WRONG, 'wrong'), (BLANK, 'blank')):

@@ -81,7 +81,8 @@ def reach_among(rects: np.ndarray, radius: float, x: float, y: float, headings: 
     return _reach(x, y, headings, length, rects, radius)
 
 
-def motion_noise(delta: np.ndarray, nominal: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def motion_noise(delta: np.ndarray, nominal: np.ndarray, normals: np.ndarray, *,
+                 exact_turns: bool = False) -> np.ndarray:
     """Displacements with Gaussian noise along the movement; none on tilt.
 
     The variance grows with the share of the nominal action that is covered, so that many short
@@ -90,6 +91,7 @@ def motion_noise(delta: np.ndarray, nominal: np.ndarray, normals: np.ndarray) ->
     Args:
         delta: [K,4] intended displacement; nominal: [K] size of the whole action [m or rad].
         normals: [K] standard normal numbers.
+        exact_turns: none on rotations either (`Simulator.exact_turns`).
     """
     noisy = delta.copy()
     share = np.sqrt(np.abs(delta[:, :3]).max(axis=1) / nominal)
@@ -97,8 +99,9 @@ def motion_noise(delta: np.ndarray, nominal: np.ndarray, normals: np.ndarray) ->
     moving = distance > 0
     scale = 1 + TRANSLATION_NOISE * share * normals / np.where(moving, distance, 1.0)
     noisy[moving, :2] *= scale[moving, None]
-    turning = (delta[:, 2] != 0) & ~moving
-    noisy[turning, 2] += (ROTATION_NOISE * share * normals)[turning]
+    if not exact_turns:
+        turning = (delta[:, 2] != 0) & ~moving
+        noisy[turning, 2] += (ROTATION_NOISE * share * normals)[turning]
     return noisy
 
 

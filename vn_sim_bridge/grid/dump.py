@@ -18,6 +18,7 @@ from vn_nav.robot import Action, RobotSpec
 from vn_sim_bridge.grid.states import COLUMNS, NAMES, count_steps
 from vn_sim_bridge.simulator import Place, Setup, Simulator
 from vn_sim_bridge.simulators import open_simulator
+from vn_sim_bridge.thor.frame import points_to_thor
 
 STEP = 0.5  # m, of Zhu et al.
 BATCH = 16  # robots that try moves side by side, and pictures drawn at a time
@@ -136,7 +137,7 @@ def _write(out: Path, simulator: Simulator, place: Place, robot: RobotSpec, step
     try:
         with h5py.File(part, 'w') as file:
             _write_pictures(file, simulator, poses)
-            file['location'] = np.column_stack([-poses[:, 1], poses[:, 0]])
+            file['location'] = points_to_thor(poses[:, :3] * (1, 1, 0))[:, [0, 2]]
             file['rotation'] = -90 * quarter % 360
             file['graph'] = by_kind[:, [NAMES[name] for name in COLUMNS]]
             file['shortest_path_distance'] = count_steps(by_kind).astype(np.int64)

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from vn_nav.errors import UserError
+from vn_sim_bridge.thor.frame import points_to_ours
 
 # Columns of a graph in this package, by what they do; -1 stands for a collision.
 FORWARD, BACKWARD, LEFT, RIGHT = range(4)
@@ -63,7 +64,7 @@ def place_states(location: np.ndarray, graph: np.ndarray, rotation: np.ndarray |
                      'rotation', f'state {np.argmin(known)} cannot move')
     yaw = (np.round(angle / 90).astype(np.int64) - 1) % 4 * (math.pi / 2)
     poses = np.zeros((len(location), 4))
-    poses[:, 0], poses[:, 1] = location[:, 1], -location[:, 0]
+    poses[:, :2] = points_to_ours(np.insert(location, 1, 0.0, axis=1))[:, :2]
     poses[:, 2] = np.where(yaw > math.pi - EXACT, yaw - 2 * math.pi, yaw)
     _check_moves(poses, graph, refuse)
     return poses, step

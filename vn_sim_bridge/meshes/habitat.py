@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import fnmatch
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -133,6 +134,18 @@ class Dataset:
             found[name] = (self.root / given if given else None), own
         return found
 
+    def stage_names(self) -> list[str]:
+        """All stages, by name."""
+        return sorted(self._stages)
+
+    def stage(self, name: str) -> Template:
+        """A stage.
+
+        Raises:
+            UserError: there is none of that name, or its configuration cannot be read.
+        """
+        return self._template(name, self._stages, 'stage')
+
     def _template(self, name: str, known: dict, kind: str) -> Template:
         """A stage or object by the name that scenes give it: with or without its folder."""
         short = str(name).split('/')[-1]
@@ -170,6 +183,27 @@ class Dataset:
                                                 if row[key] and row[value])
         return self._categories
 
+    def class_names(self) -> set[str]:
+        """Classes of objects and semantic ids, of all scenes."""
+        section = self._json.get('semantic_scene_descriptor_instances', {})
+        named = [self.root / value for value in section.values() if isinstance(value, str)]
+        return {*self.categories().values(), *(
+            name for path in [*self._lexicons, *named, *self._descriptors()] if path.is_file()
+            for name in _classes(read_object(path)).values())}
+
+    @functools.cached_property
+    def _lexicons(self) -> list[Path]:
+        return sorted([*self.root.glob('semantics/*lexicon*.json'),
+                       *self.root.glob('configs/ssd/*lexicon*.json')])
+
+    def _descriptors(self) -> list[Path]:
+        """Files of scenes' semantic descriptors that patterns lead to."""
+        section = self._json.get('semantic_scene_descriptor_instances', {})
+        return [path for patterns in section.get('paths', {}).values() for pattern in patterns
+                for found in sorted(self.root.glob(str(pattern).rstrip('/')))
+                for path in (sorted(found.iterdir()) if found.is_dir() else [found])
+                if path.name.endswith('.semantic_config.json')]
+
     def scene(self, name: str) -> SceneParts:
         """What a scene is made of.
 
@@ -191,8 +225,7 @@ class Dataset:
         if not isinstance(placed, dict) or 'template_name' not in placed:
             raise UserError('a scene has a stage', f'{self.path}: {name}', REMEDY)
         origin = str(scene.get('translation_origin', 'unknown'))
-        stage = _placed(self._template(placed['template_name'], self._stages, 'stage'), placed,
-                        'asset_local')
+        stage = _placed(self.stage(placed['template_name']), placed, 'asset_local')
         objects = [_placed(self._template(entry['template_name'], self._objects, 'object'), entry,
                            origin) for entry in scene.get('object_instances', ())]
         if left := scene.get('articulated_object_instances'):
@@ -209,21 +242,21 @@ class Dataset:
             handle = str(named).split('/')[-1].removesuffix('.semantic_config.json')
             direct = section.get(named)
             files = [self.root / direct] if isinstance(direct, str) else [
-                path for patterns in section.get('paths', {}).values() for pattern in patterns
-                for found in sorted(self.root.glob(str(pattern).rstrip('/')))
-                for path in (sorted(found.iterdir()) if found.is_dir() else [found])
+                path for path in self._descriptors()
                 if path.name == f'{handle}.semantic_config.json']
         regions: list[dict] = []
         classes: dict[int, str] = {}
-        lexicons = sorted([*self.root.glob('semantics/*lexicon*.json'),
-                           *self.root.glob('configs/ssd/*lexicon*.json')])
-        for path in [*lexicons, *(path for path in files if path.is_file())]:
+        for path in [*self._lexicons, *(path for path in files if path.is_file())]:
             found = read_object(path)
             regions += found.get('region_annotations', [])
-            classes.update({int(entry['id']): str(entry['name'])
-                            for entry in found.get('classes', ())
-                            if isinstance(entry, dict) and {'id', 'name'} <= entry.keys()})
+            classes.update(_classes(found))
         return regions, classes
+
+
+def _classes(descriptor: dict) -> dict[int, str]:
+    """Names of semantic ids that a file gives."""
+    return {int(entry['id']): str(entry['name']) for entry in descriptor.get('classes', ())
+            if isinstance(entry, dict) and {'id', 'name'} <= entry.keys()}
 
 
 def _placed(template: Template, entry: dict, origin: str) -> Instance:

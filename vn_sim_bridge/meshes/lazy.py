@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -28,8 +27,16 @@ class Loaded(NamedTuple):
     size: int  # bytes
 
 
+class Facts(NamedTuple):
+    """What is asked of a place that nobody is in: it stays when the place is let go of."""
+
+    goals: tuple[Goal, ...]
+    rooms: tuple[Room, ...]
+    floor: FloorMap
+
+
 class PlaceCache:
-    """The places that were used last.
+    """The places that were used last, and facts of all that were ever read.
 
     Args:
         makers: of each place: a function that reads it.
@@ -41,6 +48,7 @@ class PlaceCache:
                  render: Callable[[Scene], Rasterizer], budget: int = BUDGET):
         self._makers, self._render, self.budget = list(makers), render, budget
         self._kept: OrderedDict[int, Loaded] = OrderedDict()
+        self._facts: dict[int, Facts] = {}
         self.loads = 0  # places read so far, again or not
         self.in_use: frozenset[int] = frozenset()  # are never let go of
 
@@ -59,10 +67,17 @@ class PlaceCache:
             renderer = self._render(scene)
             size = sum(part.nbytes for part in renderer.pack) + place.obstacle_rects.nbytes * 6
             found = self._kept[index] = Loaded(place, renderer, size)
+            self._facts[index] = Facts(place.goals, place.rooms, place.floor)
             self.loads += 1
             self._shrink(index)
         self._kept.move_to_end(index)
         return found
+
+    def facts(self, index: int) -> Facts:
+        """Of the place of that number, which is read once for them; raises as `get` does."""
+        if index not in self._facts:
+            self.get(index)
+        return self._facts[index]
 
     def _shrink(self, newest: int) -> None:
         """Let go of the oldest ones that nobody uses."""
@@ -94,20 +109,20 @@ class LazyPlace(OnFloor):
         """All of it."""
         return self._cache.get(self._index).place
 
-    @functools.cached_property
+    @property
     def goals(self) -> tuple[Goal, ...]:
         """Where goal pictures are taken."""
-        return self.whole.goals
+        return self._cache.facts(self._index).goals
 
-    @functools.cached_property
+    @property
     def rooms(self) -> tuple[Room, ...]:
         """Rectangles of rooms; several of one name are one room."""
-        return self.whole.rooms
+        return self._cache.facts(self._index).rooms
 
-    @functools.cached_property
+    @property
     def floor(self) -> FloorMap:
         """Where the robot can stand."""
-        return self.whole.floor
+        return self._cache.facts(self._index).floor
 
     @property
     def outline(self) -> Rect:

@@ -1,11 +1,11 @@
 """A ProcTHOR house as surfaces and rooms: walls with holes cut out, boxes or meshes for objects.
 
-Unity's frame is left-handed: x right, y up, z ahead. The map's x is its x, the map's y its z, so
-that nothing is mirrored; angles about the vertical axis change their sign. It happens here alone.
+Unity's frame becomes the map's by `thor.frame`, as in the simulator `thor`: one house, one map.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Iterator
@@ -26,8 +26,8 @@ from vn_sim_bridge.meshes.thor_sizes import SIZES, UNKNOWN
 from vn_sim_bridge.meshes.vocabulary import OTHER, Vocabulary, class_name
 from vn_sim_bridge.notices import say_once
 from vn_sim_bridge.render.mesh_scene import Surface
+from vn_sim_bridge.thor.frame import TO_MAP, points_to_ours
 
-SWAP = np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]])  # Unity's axes to the map's
 # Files of meshes are right-handed (glTF): their x is Unity's -x.
 FROM_FILE = np.diag([-1.0, 1.0, 1.0])
 EDGE = 1e-3  # m: nearer points are one
@@ -152,7 +152,7 @@ def _rooms(house: dict, polygons: dict[str, np.ndarray]) -> list[RoomOutline]:
 
 def _flat(points: list[dict]) -> np.ndarray:
     """A polygon [n,2] of the floor in the map, without points twice."""
-    found = np.array([(point['x'], point['z']) for point in points], float)
+    found = points_to_ours([(point['x'], 0.0, point['z']) for point in points])[:, :2]
     keep = np.linalg.norm(found - np.roll(found, 1, axis=0), axis=1) > EDGE
     if keep.sum() < 3:
         raise ValueError('a floorPolygon has fewer than three corners')
@@ -169,15 +169,15 @@ def _polygon(polygon: np.ndarray, z: float, up: bool) -> np.ndarray:
 
 
 def _wall(entry: dict) -> Wall:
-    points = np.array([(point['x'], point['y'], point['z']) for point in entry['polygon']], float)
-    first = points[0, [0, 2]]
-    gaps = np.linalg.norm(points[:, [0, 2]] - first, axis=1)
+    points = points_to_ours([(point['x'], point['y'], point['z']) for point in entry['polygon']])
+    first = points[0, :2]
+    gaps = np.linalg.norm(points[:, :2] - first, axis=1)
     far = int(np.argmax(gaps > EDGE)) if (gaps > EDGE).any() else 0
-    step = points[far, [0, 2]] - first
+    step = points[far, :2] - first
     length = float(np.linalg.norm(step))
     material = entry.get('material')
     return Wall(str(entry['id']), first, step / max(length, EDGE), length,
-                float(points[:, 1].min()), float(points[:, 1].max()), str(entry.get('roomId', '')),
+                float(points[:, 2].min()), float(points[:, 2].max()), str(entry.get('roomId', '')),
                 _colour(material), _texture(material, WALLS))
 
 
@@ -285,7 +285,7 @@ def _post(wall: Wall, start: float, end: float, low: float, high: float,
     matrix[2, 2] = (high - low) / 2
     matrix[:2, 3] = wall.first + (start + end) / 2 * wall.along
     matrix[2, 3] = (low + high) / 2
-    return _cube() @ matrix[:3, :3].T + matrix[:3, 3]
+    return CUBE @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _cube() -> np.ndarray:
@@ -298,6 +298,9 @@ def _cube() -> np.ndarray:
                                 for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
             found += [corners[[0, 1, 2]], corners[[0, 2, 3]]]
     return np.array(found)
+
+
+CUBE = _cube()
 
 
 def _objects(house: dict, vocabulary: Vocabulary, boxes: dict, meshes: Path | None, name: str,
@@ -322,13 +325,13 @@ def _objects(house: dict, vocabulary: Vocabulary, boxes: dict, meshes: Path | No
             parts = read_parts(path)
             points = np.concatenate([part.corners for part in parts]) @ FROM_FILE.T
             middle = (points.min(axis=(0, 1)) + points.max(axis=(0, 1))) / 2
-            matrix[:3, :3] = SWAP @ turn @ FROM_FILE
-            matrix[:3, 3] = SWAP @ (position - turn @ middle)
+            matrix[:3, :3] = TO_MAP @ turn @ FROM_FILE
+            matrix[:3, 3] = TO_MAP @ (position - turn @ middle)
             surfaces += surfaces_of(parts, matrix, [label] * len(parts), [number] * len(parts))
             continue
         guessed += asset not in boxes
         size = np.array(boxes.get(asset, SIZES.get(_type(entry), UNKNOWN)))
-        corners = (_cube() * (size / 2)) @ (SWAP @ turn).T + SWAP @ position
+        corners = (CUBE * (size / 2)) @ (TO_MAP @ turn).T + TO_MAP @ position
         surfaces.append(Surface(corners[:, ::-1], None, _tint(_type(entry)), None, label, number))
     if drawn[False]:
         say_once(f'{name}: {drawn[False]} of {sum(drawn.values())} objects are labelled boxes, '
@@ -359,10 +362,13 @@ def _type(entry: dict) -> str:
     return str(entry.get('objectType') or str(entry.get('id', '')).split('|')[0])
 
 
+@functools.lru_cache(4096)
 def _tint(kind: str) -> np.ndarray:
     """A colour of a type, the same in every house."""
     rng = np.random.default_rng(list(kind.encode()))
-    return 0.25 + 0.65 * rng.random(3)
+    found = 0.25 + 0.65 * rng.random(3)
+    found.setflags(write=False)  # it is shared
+    return found
 
 
 def _colour(material: Any) -> np.ndarray:

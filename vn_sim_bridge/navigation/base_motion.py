@@ -19,13 +19,14 @@ class BaseMotion:
     Args:
         config: whether motion is noisy, and how smooth the floor is.
         robot: the actions.
+        exact_turns: of the simulator.
 
     Attributes:
         deltas: [A,4] dx, dy [m], dyaw, dpitch [rad] of the actions, exact.
     """
 
-    def __init__(self, config: EnvConfig, robot: RobotSpec):
-        self._config = config
+    def __init__(self, config: EnvConfig, robot: RobotSpec, *, exact_turns: bool = False):
+        self._config, self._exact_turns = config, exact_turns
         self.deltas = np.array([[a.dx, a.dy, a.dyaw, a.dpitch] for a in robot.actions])
         self._sizes = np.array([abs(action.size) for action in robot.actions])
 
@@ -43,7 +44,8 @@ class BaseMotion:
         if self._config.noise:
             seeds, numbers, episodes = counters
             delta = motion_noise(delta, self._sizes[actions], normal(
-                seeds, Stream.MOTION_NOISE, numbers, episodes, step))
+                seeds, Stream.MOTION_NOISE, numbers, episodes, step),
+                exact_turns=self._exact_turns)
         if self._config.randomisation.slip:
             scale = draw_grip(self._config.randomisation, *counters, step) * scale
         delta = delta.copy()

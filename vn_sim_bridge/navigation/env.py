@@ -104,7 +104,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.simulator_name = parse_scene(self.places[0].name).simulator
         self.action_names = self.robot.action_names
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
-        self._base = BaseMotion(config, self.robot)
+        self._base = BaseMotion(config, self.robot, exact_turns=self.simulator.exact_turns)
         self._odometry = None if config.odometry == 'none' else EpisodeOdometry(config.odometry, n)
         self._views = GoalViews(
             self.simulator, self.task.views, variants=config.pictures_per_goal, size=config.size,

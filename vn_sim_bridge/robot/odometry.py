@@ -107,6 +107,7 @@ class Uncertainty:
     Args:
         drift: as of `drift_errors`.
         period: of a tick [s].
+        exact_turns: the simulator's turns have no motion noise.
 
     Attributes:
         pose: [3,3] covariance of x, y [m], yaw [rad] in the odom frame, since the start.
@@ -116,8 +117,9 @@ class Uncertainty:
     # The least variance: a tenth of a millimetre, 0.006 degrees. Filters invert these matrices.
     FLOOR = 1e-8
 
-    def __init__(self, drift: float, period: float):
+    def __init__(self, drift: float, period: float, *, exact_turns: bool = False):
         self._drift, self._period = drift, period
+        self._turn_variance = 0.0 if exact_turns else ROTATION_NOISE**2
         self.pose = self.FLOOR * np.eye(3)
         self.rest()
 
@@ -137,7 +139,7 @@ class Uncertainty:
         way = math.hypot(dx, dy)
         rotation, along = (deviation**2 for deviation in _deviations(motion, self._drift))
         along += noise * TRANSLATION_NOISE**2 * (way > 0)
-        turn = 2 * rotation + noise * ROTATION_NOISE**2 * (way == 0 and dyaw != 0)
+        turn = 2 * rotation + noise * self._turn_variance * (way == 0 and dyaw != 0)
         ux, uy = (dx / way, dy / way) if way > 0 else (1.0, 0.0)
         c, s = math.cos(yaw + dyaw / 2), math.sin(yaw + dyaw / 2)
         # Where the pose goes with the rotation before the way, and with the way itself.

@@ -107,7 +107,8 @@ class SimulatedRobot:
         self.tick_count = 0
         self.odometry_drift = odometry_drift
         self.odometry = np.zeros(3)  # x, y, yaw in the odom frame
-        self.uncertainty = Uncertainty(odometry_drift, TICK)  # of the odometry
+        self.uncertainty = Uncertainty(  # of the odometry
+            odometry_drift, TICK, exact_turns=self.simulator.exact_turns)
         self.base = SimulatedBase(robot, TICK)
         self.velocity = np.zeros(4)  # of the body in the last tick: vx, vy, wz, tilt rate
         self.episode: Episode | None = None
@@ -287,7 +288,8 @@ class SimulatedRobot:
         number = normal(self.seed, Stream.MOTION_NOISE, 0, self.episode.index if self.episode
                         else 0, self.tick_count)
         return motion_noise(wanted[None], np.array([self._nominal_size(wanted)]),
-                            np.atleast_1d(number))[0]
+                            np.atleast_1d(number),
+                            exact_turns=self.simulator.exact_turns)[0]
 
     def _nominal_size(self, wanted: np.ndarray) -> float:
         """Of the whole action [m or rad] that a displacement [4] is a part of."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +16,14 @@ from vn_nav.errors import UserError
 from vn_nav.scenes import SceneName, options_of, whole_number
 from vn_nav.structured_file import read_json
 from vn_sim_bridge.floor.mesh_floor import HEIGHT
-from vn_sim_bridge.meshes.habitat import SUFFIX, Dataset, Instance
+from vn_sim_bridge.meshes.classes import (
+    common_names,
+    dataset_classes,
+    file_classes,
+    files_beside,
+    files_of,
+)
+from vn_sim_bridge.meshes.habitat import ASSETS, SUFFIX, Dataset, Instance
 from vn_sim_bridge.meshes.parts import MAP, by_direction, named_surfaces
 from vn_sim_bridge.meshes.place import MeshPlace, PlaceRules, RoomOutline, make_place
 from vn_sim_bridge.meshes.semantics import SemanticMesh, Thing, read_annotations, split_large
@@ -29,7 +35,6 @@ from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.simulator import Setup
 
 OPTIONS = ('scene', 'storey', 'up', 'scale', 'height', 'labels', 'doors')
-FILES = ('.glb', '.gltf', '.obj')
 FIRST_OBJECT = 10_000  # number of an instance; those of the stage are before it
 REGION_MARGIN = 0.3  # m below and above what a region's objects span
 
@@ -49,18 +54,21 @@ class GltfSimulator(MeshSimulator):
                 raise UserError('a scene of gltf is a file: .glb, .gltf, .obj or '
                                 f'{SUFFIX}', str(scene), 'correct the path; data sets are not '
                                 'shipped: docs/simulators/gltf.md says where to get them')
-            if path.suffix.lower() in FILES:
+            if path.suffix.lower() in ASSETS:
                 found.append(_MeshFile(scene, path))
             elif path.name.endswith(SUFFIX):
-                dataset = datasets.setdefault(path, Dataset(path))
+                if path not in datasets:
+                    datasets[path] = Dataset(path)
+                dataset = datasets[path]
                 found += [_HabitatScene(one, dataset) for one in _chosen(scene, dataset)]
             else:
-                raise UserError(f'a scene of gltf ends in {", ".join(FILES)} or {SUFFIX}',
+                raise UserError(f'a scene of gltf ends in {", ".join(ASSETS)} or {SUFFIX}',
                                 str(scene), 'convert it, for instance with Blender')
-        vocabulary = _vocabulary(found)
-        return cls([str(one.scene) for one in found],
-                   [functools.partial(one.make, setup, vocabulary) for one in found], setup,
-                   vocabulary.names, rooms=all(one.has_rooms for one in found))
+        vocabularies = _vocabularies(found)
+        names = [str(one.scene) for one in found]
+        return cls(names, [functools.partial(one.make, setup, vocabulary)
+                           for one, vocabulary in zip(found, vocabularies, strict=True)], setup,
+                   common_names(vocabularies, names), rooms=all(one.has_rooms for one in found))
 
 
 def _chosen(scene: SceneName, dataset: Dataset) -> list[SceneName]:
@@ -76,8 +84,8 @@ def _chosen(scene: SceneName, dataset: Dataset) -> list[SceneName]:
             for name in names]
 
 
-def _vocabulary(found: Sequence[_MeshFile | _HabitatScene]) -> Vocabulary:
-    """The classes of some scenes: of their semantic files, or of a list that an option names."""
+def _vocabularies(found: Sequence[_MeshFile | _HabitatScene]) -> list[Vocabulary]:
+    """The classes of each scene: of its file, its data set, or a list that an option names."""
     lists = {dict(one.scene.options).get('labels') for one in found} - {None}
     if len(lists) > 1:
         raise UserError('scenes that are opened together have one list of labels',
@@ -88,11 +96,12 @@ def _vocabulary(found: Sequence[_MeshFile | _HabitatScene]) -> Vocabulary:
         names = read_json(path, 'a list of labels', remedy).get('labels')
         if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
             raise UserError('a list of labels has names under "labels"', path, remedy)
-        return Vocabulary(dict.fromkeys(names, 1), path)
-    counts: Counter[str] = Counter()
+        return [Vocabulary(dict.fromkeys(names, 1), path)] * len(found)
+    known: dict[object, Vocabulary] = {}
     for one in found:
-        counts.update(one.categories())
-    return Vocabulary(counts, 'the scenes')
+        if one.origin not in known:
+            known[one.origin] = Vocabulary(dict.fromkeys(one.classes(), 1), str(one.origin))
+    return [known[one.origin] for one in found]
 
 
 class _Scene:
@@ -131,12 +140,13 @@ class _MeshFile(_Scene):
                             'leave it out for a single file')
         self.matrix = (np.eye(4) if options.get('up') == 'z' else MAP) @ np.diag(
             [_number(scene, options, 'scale', 1.0)] * 3 + [1.0])
-        self.semantic = _beside(path)
+        self.origin = path  # of its classes
+        self.semantic = files_beside(path)
         self.has_rooms = self.semantic is not None
 
-    def categories(self) -> Counter[str]:
-        """How often each class occurs in the semantic file."""
-        return _categories(self.semantic)
+    def classes(self) -> set[str]:
+        """Those of its semantic file."""
+        return file_classes(self.semantic)
 
     def make(self, setup: Setup, vocabulary: Vocabulary) -> tuple[MeshPlace, Scene]:
         """Read it."""
@@ -157,29 +167,17 @@ class _HabitatScene(_Scene):
     def __init__(self, scene: SceneName, dataset: Dataset):
         super().__init__(scene)
         self.dataset, self.name = dataset, dict(scene.options)['scene']
+        self.origin = dataset.path  # of its classes
         if {'up', 'scale'} & dict(scene.options).keys():
             raise UserError('axes and scale of a data set stand in its configuration', str(scene),
                             'leave out up and scale')
         self.parts = dataset.scene(self.name)  # small: names and matrices
-        self.semantic = self._files()
+        self.semantic = files_of(self.parts.stage.template)
         self.has_rooms = bool(self.parts.regions) or self.semantic is not None
 
-    def _files(self) -> tuple[Path, Path] | None:
-        stage = self.parts.stage.template
-        mesh = stage.asset('semantic_asset')
-        text = stage.asset('semantic_descriptor_filename') or stage.asset('house_filename')
-        if mesh is not None and text is not None and mesh.suffix in FILES:
-            return mesh, text
-        asset = stage.asset()
-        return None if asset is None else _beside(asset)
-
-    def categories(self) -> Counter[str]:
-        """How often each class occurs."""
-        counts = _categories(self.semantic)
-        for instance in self.parts.objects:
-            if found := self.dataset.category(instance.template, self.parts.classes):
-                counts[found] += 1
-        return counts
+    def classes(self) -> set[str]:
+        """Those of its data set."""
+        return dataset_classes(self.dataset)
 
     def make(self, setup: Setup, vocabulary: Vocabulary) -> tuple[MeshPlace, Scene]:
         """Read stage and objects."""
@@ -273,21 +271,6 @@ def _region(entry: dict, scene: SceneName) -> RoomOutline:
         raise UserError('a region has label and poly_loop (corners x, y, z)',
                         f'{scene}: {str(entry)[:60]}: {error}',
                         'take the data set as it was downloaded') from error
-
-
-def _beside(path: Path) -> tuple[Path, Path] | None:
-    """The semantic files that lie beside a stage; None: there are none."""
-    stem = path.name.removesuffix(path.suffix).removesuffix('.basis')
-    mesh, text = (path.parent / f'{stem}.semantic.{ending}' for ending in ('glb', 'txt'))
-    if mesh.is_file() != text.is_file():
-        say_once(f'{path.name}: of its two semantic files one is missing; it has no labels')
-    return (mesh, text) if mesh.is_file() and text.is_file() else None
-
-
-def _categories(semantic: tuple[Path, Path] | None) -> Counter[str]:
-    if semantic is None:
-        return Counter()
-    return Counter(thing.category for thing in read_annotations(semantic[1]).values())
 
 
 def _number(scene: SceneName, options: dict[str, str], name: str, default: float) -> float:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import gzip
 import importlib.util
-import itertools
 import json
 import re
 import zlib
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from vn_nav.errors import UserError
 from vn_nav.scenes import SceneName, options_of
+from vn_sim_bridge.meshes.house_file import HouseFile
 from vn_sim_bridge.meshes.place import MeshPlace, PlaceRules, make_place
 from vn_sim_bridge.meshes.procthor import house_surfaces
 from vn_sim_bridge.meshes.simulator import MeshSimulator
@@ -23,22 +23,24 @@ from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.simulator import Setup
 
 OPTIONS = ('index', 'meshes', 'assets', 'doors')
-MOST_BYTES = 64 << 20  # of one house: those of ProcTHOR-10K have 0.1 MB
 REMEDY = 'take a house of ProcTHOR-10K; docs/simulators/procthor.md says where to get them'
 
 
 class ProcthorSimulator(MeshSimulator):
     """Robots in ProcTHOR's houses."""
 
+    version = '2'  # 1: the map was turned by a quarter against that of the simulator thor
+
     @classmethod
     def open(cls, scenes: Sequence[SceneName], setup: Setup) -> ProcthorSimulator:
         """See `BaseSimulator.open`."""
         found = [one for scene in scenes for one in _expanded(scene)]
+        files = _files(found)
         # One list of classes for every house: AI2-THOR's types.
         vocabulary = Vocabulary(dict.fromkeys(SIZES, 1), 'ProcTHOR')
         return cls([str(one) for one in found],
-                   [functools.partial(_make, one, setup, vocabulary) for one in found], setup,
-                   vocabulary.names)
+                   [functools.partial(_make, one, files[one.place], setup, vocabulary)
+                    for one in found], setup, vocabulary.names)
 
 
 def _expanded(scene: SceneName) -> list[SceneName]:
@@ -74,11 +76,12 @@ def _expanded(scene: SceneName) -> list[SceneName]:
             for k in range(first, last + 1)]
 
 
-def _make(scene: SceneName, setup: Setup, vocabulary: Vocabulary) -> tuple[MeshPlace, Scene]:
+def _make(scene: SceneName, file: HouseFile, setup: Setup, vocabulary: Vocabulary
+          ) -> tuple[MeshPlace, Scene]:
     """Read a house."""
     options = dict(scene.options)
     made = house_surfaces(
-        read_house(scene), vocabulary, str(scene), boxes=_boxes(options.get('assets')),
+        read_house(scene, file), vocabulary, str(scene), boxes=_boxes(options.get('assets')),
         meshes=Path(options['meshes']) if 'meshes' in options else None,
         doors_as_given=options.get('doors') == 'as_given')
     return make_place(str(scene), made.surfaces, vocabulary.names, setup.robot, rooms=made.rooms,
@@ -86,38 +89,50 @@ def _make(scene: SceneName, setup: Setup, vocabulary: Vocabulary) -> tuple[MeshP
                       goal_seed=setup.goal_seed)
 
 
-def read_house(scene: SceneName) -> dict:
+def _files(scenes: Sequence[SceneName]) -> dict[str, HouseFile]:
+    """The files of some houses, passed through once: each has the last that is asked of it.
+
+    Raises:
+        UserError: it has not, or it cannot be read.
+    """
+    last: dict[str, SceneName] = {}
+    for scene in scenes:
+        if scene.place not in last or _index(scene) > _index(last[scene.place]):
+            last[scene.place] = scene
+    files = {place: HouseFile(Path(place).expanduser()) for place in last}
+    for place, scene in last.items():
+        with _whole(scene):
+            if not files[place].has(_index(scene)):
+                raise UserError(f'{files[place].path.name} has a house of that number', str(scene),
+                                'choose a smaller index')
+    return files
+
+
+def _index(scene: SceneName) -> int:
+    return int(dict(scene.options).get('index', 0))
+
+
+@contextlib.contextmanager
+def _whole(scene: SceneName) -> Iterator[None]:
+    """What reading a house raises, in a line."""
+    try:
+        yield
+    except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
+        raise UserError('a house of ProcTHOR is whole JSON', f'{scene}: {error}',
+                        REMEDY) from error
+
+
+def read_house(scene: SceneName, file: HouseFile) -> dict:
     """The JSON of a house.
 
     Raises:
         UserError: no whole file, or not so many houses in it.
     """
-    path = Path(scene.place).expanduser()
-    number = int(dict(scene.options).get('index', 0))
-    try:
-        text = next(itertools.islice(_texts(path), number, None), None)
-        if text is None:
-            raise UserError(f'{path.name} has a house of that number', str(scene),
-                            'choose a smaller index')
-        house = json.loads(text)
-    except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
-        raise UserError('a house of ProcTHOR is whole JSON', f'{scene}: {error}',
-                        REMEDY) from error
+    with _whole(scene):
+        house = json.loads(file.text(_index(scene)) or b'')
     if not isinstance(house, dict) or not isinstance(house.get('rooms'), list):
         raise UserError('a house of ProcTHOR is an object with rooms', str(scene), REMEDY)
     return house
-
-
-def _texts(path: Path) -> Iterator[bytes]:
-    """The houses of a file, not more of them in memory than one."""
-    opened = gzip.open(path, 'rb') if path.suffix == '.gz' else path.open('rb')
-    with opened as file:
-        while text := (file.readline(MOST_BYTES) if '.jsonl' in path.suffixes
-                       else file.read(MOST_BYTES)):
-            if len(text) == MOST_BYTES:
-                raise ValueError(f'a house has more than {MOST_BYTES >> 20} MiB')
-            if text.strip():
-                yield text
 
 
 @functools.lru_cache(2)

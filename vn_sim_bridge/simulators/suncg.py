@@ -23,6 +23,7 @@ from vn_sim_bridge.suncg.place import OBSTACLES, Options, read_place
 
 FOLDER = 'SUNCG_PATH'
 OPTIONS = ('data', 'level', 'labels', 'obstacles', 'targets', 'layout', 'depth')
+COMMON = {'data': '', 'labels': 'nyu40', 'depth': 'metres'}  # one for all scenes
 DEPTH_SCALE = 20.0  # m, that House3D's 255 stands for
 REMEDY = f'set {FOLDER} to the folder with house, room, object and texture, or add ?data=FOLDER ' \
     'to the scene; the data set is not for download: docs/simulators/suncg.md'
@@ -38,8 +39,8 @@ class SuncgSimulator(MeshSimulator):
     @classmethod
     def open(cls, scenes: Sequence[SceneName], setup: Setup) -> SuncgSimulator:
         """See `BaseSimulator.open`."""
-        data, labels, depth = (_common(scenes, name, default) for name, default in (
-            ('data', ''), ('labels', 'nyu40'), ('depth', 'metres')))
+        data, labels, depth = (_common(scenes, name, default)
+                               for name, default in COMMON.items())
         if depth not in ('metres', 'house3d'):
             raise UserError('depth is metres or house3d', depth, 'choose one of them')
         folder = data_folder(data)

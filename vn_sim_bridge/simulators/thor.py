@@ -33,6 +33,7 @@ from vn_sim_bridge.thor.names import LABEL_NAMES, SPLITS, class_of, scene_names
 from vn_sim_bridge.thor.place import ThorPlace
 
 PROCTHOR = 'procthor'
+OURS = 2  # of our side; 1 (not written then) had motion noise on rotations, too
 MOVES, OBJECTS = ('bisect', 'arm'), ('still', 'random')  # the first is the default
 
 T = TypeVar('T')
@@ -51,6 +52,7 @@ class ThorSimulator(BaseSimulator):
     capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True,
                                 tilt=True, own_objects=True)
     label_names = LABEL_NAMES
+    exact_turns = True  # thesis, 5.6: noise along the motion alone
     # Which objects those are, each room says itself: `ThorPlace.object_goals`.
     task_objects = {'object': ('movable object of the room',)}
     splits = SPLITS
@@ -69,7 +71,7 @@ class ThorSimulator(BaseSimulator):
 
     def __init__(self, names: Sequence[str], scenes: Sequence[Scene], setup: Setup, *,
                  arm: bool = False, shuffle: bool = False):
-        self.version = f'ai2thor-{importlib.metadata.version("ai2thor")}'
+        self.version = f'ai2thor-{importlib.metadata.version("ai2thor")}-{OURS}'
         self.shuffle = shuffle or bool(setup.models)  # a task that looks for objects
         robot, count = setup.robot, setup.num_envs
         self._lost = np.zeros(count, bool)  # since `broken_off` was last asked

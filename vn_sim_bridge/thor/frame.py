@@ -1,8 +1,9 @@
-"""The one place where AI2-THOR's frame becomes ours.
+"""The one place where AI2-THOR's frame becomes ours: for its engine, its houses and its dumps.
 
 Unity's frame is left-handed: x right, y up, z forward; `rotation` turns clockwise seen from above,
 `horizon` looks down, both in degrees. Ours is right-handed: x forward, y left, z up, yaw turns
-counter-clockwise, pitch looks down, in radians. So (x, y, z) = (Z, -X, Y), yaw = -rotation.
+counter-clockwise, pitch looks down, in radians. So (x, y, z) = (Z, -X, Y), yaw = -rotation: a
+change of hands, and nothing is mirrored.
 """
 
 from __future__ import annotations
@@ -14,7 +15,18 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 
+TO_MAP = np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]])  # Unity's axes to the map's
 HORIZON = (-30.0, 60.0)  # degrees that the agent can look up and down to
+
+
+def points_to_ours(points) -> np.ndarray:
+    """Points [...,3] x, y, z [m] of Unity in the map frame."""
+    return np.asarray(points, float) @ TO_MAP.T
+
+
+def points_to_thor(points) -> np.ndarray:
+    """Points [...,3] of the map frame as Unity has them."""
+    return np.asarray(points, float) @ TO_MAP
 
 
 def point_to_ours(position: Mapping[str, float]) -> tuple[float, float, float]:

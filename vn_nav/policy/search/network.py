@@ -107,6 +107,7 @@ class SearchPolicy(Policy):
     `recogniser` reads the comparison, `ranges` sees the picture alone.
     """
 
+    uses_odometry = True
     encoder: Matching
 
     def _build(self, config: NetworkConfig) -> None:
