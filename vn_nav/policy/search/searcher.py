@@ -250,7 +250,8 @@ class Searcher:
             dx, dy, _ = self.moves[action]
             length = math.hypot(dx, dy)
             angle = self.pose[2] + math.atan2(dy, dx)
-            if not self._is_blocked(angle) and ways.cut(*self.pose[:2], angle, length)[0] >= 0.9 * length and (
-                    self._last not in (self._left, self._right) or dx > 0):
+            free = not self._is_blocked(angle) and (
+                ways.cut(*self.pose[:2], angle, length)[0] >= 0.9 * length)
+            if free and (dx > 0 or self._last not in (self._left, self._right)):
                 return int(action)
         return self._right if self._last == self._right else self._left
