@@ -133,22 +133,40 @@ class PolicyRuntime:
         if self._last_action >= 0:  # else an episode begins
             self._last_action = action
 
+    def reset_odometry(self) -> None:
+        """Say that the poses given to `act` from now on are in another frame than those before.
+
+        The odometry jumped or was set anew: how the robot moved between the last picture and the
+        next one, odometry does not tell. The episode goes on. A network has no use for odometry,
+        and forgets nothing.
+        """
+
     @property
     def arrived(self) -> bool:
         """Whether the policy declares, at the picture that `act` saw last, that it is there."""
         return self.stop_threshold is not None and self.arrival > self.stop_threshold
 
     @torch.inference_mode()
-    def act(self, image: np.ndarray) -> int:
-        """The next action for a picture, uint8 [3,S,S]; remembered as the last action.
+    def act(self, image: np.ndarray, odometry: np.ndarray | None = None) -> int:
+        """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
         is over, and the next picture begins another one towards the same goal.
 
+        Args:
+            image: the picture, uint8 [3,S,S].
+            odometry: [3] float64 x, y [m], yaw [rad] of the robot there, in any frame that stays
+                the same until `reset_odometry`, `reset` or `set_goal`; what counts is how it
+                changes. None: unknown at this picture; the frame stays. A network does not use
+                it.
+
         Raises:
             FloatingPointError: the outputs are not finite; memory and last action stay.
-            UserError: no goal yet, or a picture of another shape or type.
+            UserError: no goal yet, a picture of another shape or type, or a pose that is none.
         """
+        if odometry is not None and not (odometry.shape == (3,) and np.isfinite(odometry).all()):
+            raise UserError('odometry is x, y and yaw, finite', odometry.tolist(),
+                            'pass None where the pose is unknown')
         if self._goal_maps is None:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
