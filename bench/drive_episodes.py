@@ -170,7 +170,7 @@ def without_ros(options, policy: PolicyRuntime | None, pictures: list[GoalPictur
         if policy is None:
             return int(rng.integers(len(deltas) + declares))
         picture = np.ascontiguousarray(robot.observe().rgb[0].transpose(1, 2, 0))
-        action = policy.act(preprocess(picture, policy.size))
+        action = policy.act(preprocess(picture, policy.size), robot.odometry)
         return len(deltas) if declares and policy.arrived else action
     found = []
     for index in range(options.episodes):

@@ -53,8 +53,8 @@ TOPICS = (
     Topic('shadow/cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
           'mode shadow, in place of cmd_vel: no base subscribes to it', depth=1),
     Topic('executed_action', _STRING, 'user',
-          'mode shadow: JSON: the stamp of a picture where a decision is wanted, and the action '
-          'really done before it'),
+          'mode shadow: JSON: the stamp of a picture where a decision is wanted, the action '
+          'really done before it, and odometry [x, y, yaw] there, if known'),
     Topic('odom', 'nav_msgs/msg/Odometry', 'robot', 'wheel odometry; actions are closed on it'),
     _history('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
     _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),

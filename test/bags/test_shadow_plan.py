@@ -21,6 +21,7 @@ def test_a_decision_is_wanted_where_training_takes_a_picture(tmp_path):
     names = [None if a == NO_ACTION else DRIVE_ACTIONS[a] for a in drives.action]
     assert [d.done for d in plan.decisions] == [None, *names[:-1]]
     assert [d.last for d in plan.decisions] == [False] * (len(names) - 1) + [True]
+    assert np.array([d.pose for d in plan.decisions]) == pytest.approx(np.array(drives.pose))
     assert plan.goals.shown == 1 and plan.rate == 20.0 and plan.camera_info is not None
     events = [event for event in plan.events() if event is not None]
     shown = [event for event in events if event.decision is not None]

@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,11 @@ from ros_harness import write_checkpoint
 from vn_nav.cli import main
 from vn_nav.evaluation.evaluator import ENVIRONMENTS, SHORTEST
 from vn_nav.learning.teach_evaluation import BEFORE, MIN_EPISODES, RIGHT, Cost, Row, plan, rows_of
+from vn_nav.learning.teaching import Teaching
 from vn_nav.policy.checkpoint import CONFIG, load_checkpoint
+from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.robot import DRIVE_ACTIONS
 
 
 @pytest.fixture(scope='module')
@@ -31,6 +36,7 @@ def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, ca
     assert 'all goals of bag' in capsys.readouterr().out
     result = json.loads(figures.read_text())
     assert result['bag'] == 'bag' and list(result['splits']) == ['all_goals']
+    assert result['odometry'] == 'none'
     rows = result['splits']['all_goals']['rows']
     assert list(rows) == ['arrival', 'declared']
     assert all(row['episodes'] == 8 for own in rows.values() for row in own.values())
@@ -38,6 +44,11 @@ def test_any_checkpoint_is_measured_in_the_pictures_of_a_drive(bag, tmp_path, ca
     assert success['shortest path'] > 0.8 > success['random actions']
     shown = page.read_text()
     assert shown.count('<svg') == 6 and 'House' not in shown and 'drive bag' in shown
+    # A policy that uses odometry is given it there too.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Policy, 'uses_odometry', True)
+        assert main([*arguments, '--no-controls']) == 0
+    assert json.loads(figures.read_text())['odometry'] == 'drift'
     # As `vn_nav teach` divides them: other goals, so other starts.
     assert main([*arguments, '--split', 'seen_goals', '--split', 'unseen_goals',
                  '--no-controls']) == 0
@@ -95,3 +106,19 @@ def test_rows_and_episodes_are_as_many_as_there_is_time_for():
     assert plan(rows, costs, 3, -1.0, 300).episodes == 3
     many = plan(rows, costs, 2 * ENVIRONMENTS, math.inf, 300)  # two rounds
     assert math.isclose(many.seconds, 2 * whole.seconds)
+
+
+class UsesOdometry(Policy):
+    """It would, if it had a map."""
+
+    uses_odometry = True
+
+
+def test_rows_of_a_taught_place_have_the_odometry_of_whoever_uses_it():
+    config = NetworkConfig(actions=DRIVE_ACTIONS, size=36, channels=(4, 4, 4), features=8,
+                           hidden=8)
+    plain, using = Policy(config), UsesOdometry(config)
+    for network, before, odometry in ((plain, None, 'none'), (plain, plain, 'none'),
+                                      (using, None, 'drift'), (plain, using, 'drift')):
+        given = None if before is None else SimpleNamespace(network=before)
+        assert Teaching._odometry(SimpleNamespace(given=given), network) == odometry

@@ -78,6 +78,14 @@ def test_drift_is_the_true_motion_with_the_models_errors():
     assert np.sqrt(np.mean((gaps[:, 2] / wanted) ** 2)) == pytest.approx(1.0, rel=0.2)
     assert abs(np.mean(gaps[:, 2] / wanted)) < 0.25
     assert 0.005 < np.sqrt(np.mean(gaps[:, :2] ** 2)) < 0.1
+    # No number serves twice: turns alone, whose errors would add up faster than their variances.
+    _, info = env.reset(seed=2)
+    start = info['pose'].copy()
+    for _ in range(24):
+        observation, _, _, _, info = env.step(np.ones(200, int))
+    gaps = off(observation['odometry'], from_start(info['pose'], start))
+    assert np.sqrt(np.mean(gaps[:, 2] ** 2)) == pytest.approx(
+        math.sqrt(1e-5 * 24 * math.radians(30)), rel=0.2)
 
 
 def test_drift_depends_on_seed_and_episode_not_on_the_number_of_environments():

@@ -161,6 +161,9 @@ def test_the_node_says_along_a_bag_what_the_policy_says_without_ros(tmp_path, ca
     # The stamps are the bag's, nothing in it can reach a base, and everybody can read it.
     pictures = {r.stamp for r in read_bag(FIXTURE, ('image_raw',))}
     assert {answer.time for answer in a.answers} <= pictures
+    where = [json.loads(r.message.data)['odometry'] for r in read_bag(
+        tmp_path / 'both' / 'a', ('shadow/executed_action',))]
+    assert np.array(where) == pytest.approx(np.array(drives.pose), abs=1e-6)
     odometries = {r.stamp for r in read_bag(FIXTURE, ('odom',))}
     assert a.commands.keys() <= pictures | odometries
     assert {r.topic.split('/')[0] for r in read_bag(tmp_path / 'both' / 'a')} == {'shadow'}

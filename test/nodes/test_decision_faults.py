@@ -25,10 +25,10 @@ import time
 from vn_nav.policy.runtime import PolicyRuntime
 act = PolicyRuntime.act
 calls = []
-def slow(self, image):
+def slow(self, *seen):
     calls.append(1)
     time.sleep(1.5 if len(calls) > 8 else 0)
-    return act(self, image)
+    return act(self, *seen)
 PolicyRuntime.act = slow
 """
 
@@ -60,11 +60,11 @@ BROKEN = """
 from vn_nav.policy.runtime import PolicyRuntime
 act = PolicyRuntime.act
 calls = []
-def broken(self, image):
+def broken(self, *seen):
     calls.append(1)
     if len(calls) == 5:
         raise RuntimeError('the accelerator is gone')
-    return act(self, image)
+    return act(self, *seen)
 PolicyRuntime.act = broken
 """
 

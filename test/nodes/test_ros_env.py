@@ -122,7 +122,8 @@ def test_it_shows_what_the_simulator_itself_would_show(tmp_path):
     Of an episode's end the bridge shows no picture: the one before stands in.
     """
     inner = NavigationEnv(EnvConfig(scenes=('house:7?rooms=1',), num_envs=1, size=36, noise=False,
-                                    max_decisions=6, seed=3), load_robot(BASE))
+                                    max_decisions=6, seed=3, odometry='commanded'),
+                          load_robot(BASE))
     with bridge(tmp_path, noise=False), RosEnv(ROBOT, 36, lock_step=True) as env:
         assert env.num_envs == 1 and env.action_names == inner.action_names
         assert isinstance(env, NavigationVectorEnv) and env.simulator_name == 'house'
@@ -136,6 +137,7 @@ def test_it_shows_what_the_simulator_itself_would_show(tmp_path):
         goal = env.goals[seen['goal_index'][0]]
         assert np.array_equal(goal, inner.goals[shown['goal_index'][0]])
         assert np.array_equal(seen['image'], shown['image'])
+        assert np.array_equal(seen['odometry'], np.zeros((1, 3)))
         for k, action in enumerate([2, 0, 3, 3, 0, 1]):
             before, (seen, reward, terminated, truncated, info) = seen, env.step([action])
             shown, wanted, ended, cut, told = inner.step([action])
@@ -146,6 +148,7 @@ def test_it_shows_what_the_simulator_itself_would_show(tmp_path):
             if k < 5:
                 difference = np.abs(seen['image'].astype(int) - shown['image'])
                 assert (difference > 2).mean() < 0.01
+                assert np.abs(seen['odometry'] - shown['odometry']).max() < 1e-3
                 assert info['depth'].shape == (1, 36, 36) and info['depth'].dtype == np.float32
                 assert (info['segmentation'] == seen_labels(inner)).mean() > 0.98
             else:

@@ -199,6 +199,22 @@ def test_runtime_and_batched_policy_agree(tmp_path, frames):
         runtime.act(np.zeros((3, 20, 20), np.uint8))
 
 
+def test_odometry_reaches_a_runtime_and_a_network_ignores_it(tmp_path):
+    save_checkpoint(tmp_path / 'model', Policy(SMALL), FACTS)
+    chosen = []
+    for tells in (False, True):
+        runtime = PolicyRuntime(tmp_path / 'model', decoding='greedy')
+        runtime.set_goal(pictures(1, seed=1)[0])
+        for t, image in enumerate(pictures(4)):
+            if tells:
+                runtime.reset_odometry()
+            chosen.append(runtime.act(image, np.array([0.1 * t, 2.0, 0.5]) if tells else None))
+    assert chosen[:4] == chosen[4:]
+    for wrong in (np.zeros(2), np.array([0.0, np.nan, 0.0])):
+        with pytest.raises(UserError, match='x, y and yaw'):
+            runtime.act(image, wrong)
+
+
 def test_a_policy_that_knows_its_moves_does_not_repeat_a_contact(tmp_path):
     config = dataclasses.replace(
         SMALL, heads=('goal_pose',), pose_to_memory=True,

@@ -197,6 +197,24 @@ def test_without_odometry_it_counts_on_its_moves_and_sees_that_it_stood_still():
     assert own.grid.touched.any()
 
 
+def test_odometry_counts_by_its_changes_and_gaps_by_the_nominal_moves():
+    own = searcher()
+    own.step(sight(), -1, np.array([7.0, -3.0, math.pi / 2]))
+    own.step(sight(), FORWARD, np.array([7.0, -2.6, math.pi / 2]))
+    np.testing.assert_allclose(own.pose, [0.4, 0.0, 0.0], atol=1e-9)
+    own.step(sight(), FORWARD, None)  # unknown here, and so is the way to the next one
+    own.step(sight(), FORWARD, np.array([7.0, -1.5, math.pi / 2]))
+    np.testing.assert_allclose(own.pose, [1.4, 0.0, 0.0], atol=1e-9)
+    own.reset_odometry()
+    own.step(sight(), LEFT, np.array([0.0, 0.0, 0.0]))
+    own.step(sight(), FORWARD, np.array([0.45, 0.0, 0.0]))
+    np.testing.assert_allclose(own.pose, [1.4 + 0.45 * math.cos(math.pi / 6), 0.225, math.pi / 6],
+                               atol=1e-9)
+    assert not own.grid.touched.any()
+    own.step(sight(), FORWARD, np.array([0.5, 0.0, 0.0]))
+    assert own.grid.touched.any()
+
+
 def test_a_move_that_met_something_is_not_tried_again_there():
     own = searcher()
     last, odometry = -1, np.zeros(3)

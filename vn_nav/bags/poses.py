@@ -36,9 +36,7 @@ class OdometryPoses:
         one, other = before.value, after.value
         span = after.stamp - before.stamp
         share = np.clip((stamp - before.stamp) / span, 0, 1) if span > 0 else 0.0
-        pose = one + share * (other - one)
-        pose[2] = one[2] + share * wrap_angle(other[2] - one[2])
-        return pose
+        return interpolate(one, other, share)
 
 
 class DeadReckoning:
@@ -71,6 +69,13 @@ class DeadReckoning:
             if lasts > 0:
                 self._pose = integrate(self._pose, self._velocity, lasts)
         self._at = time if self._at is None else max(self._at, time)
+
+
+def interpolate(one: np.ndarray, other: np.ndarray, share: float) -> np.ndarray:
+    """The pose [3] a share of the way from one to another, turning the shorter way round."""
+    pose = one + share * (other - one)
+    pose[2] = one[2] + share * wrap_angle(other[2] - one[2])
+    return pose
 
 
 def integrate(pose: np.ndarray, velocity: np.ndarray, seconds: float) -> np.ndarray:

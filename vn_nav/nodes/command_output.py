@@ -16,6 +16,7 @@ from vn_msgs_py import motion
 from vn_nav.nodes.qos import qos
 from vn_nav.policy.clock_watch import ClockWatch
 from vn_nav.policy.navigator import Navigator
+from vn_nav.policy.pose_track import PoseTrack
 
 TOPIC = 'cmd_vel'
 LOCK_STEP_SILENCE_S = 0.5  # without odometry, after which lock-step sends a command unasked
@@ -24,6 +25,7 @@ CROSSING_S = 0.03  # of wall time, see _lock_step
 JUMP_M, JUMP_RAD = 0.1, 0.3
 # Times the robot's limits: they are conservative, and messages come in bursts.
 PLAUSIBLE_SPEED_FACTOR = 3.0
+POSE_AGE_S = 0.2  # that a pose may be older than a picture in motion
 REORDERED_S = 1.0  # odometry from longer ago is from another time
 
 
@@ -44,6 +46,7 @@ class CommandOutput:
     Attributes:
         publisher: of the commands.
         odometry: [3] x, y [m], yaw [rad] of the newest message; None before the first.
+        track: its poses, for `pose_at`.
     """
 
     def __init__(self, node, navigator: Navigator, wake: threading.Condition, *, period: float,
@@ -55,6 +58,7 @@ class CommandOutput:
         self._stamped, self._patience = stamped, patience
         self.publisher = node.create_publisher(TwistStamped if stamped else Twist, name, qos(name))
         self.odometry: np.ndarray | None = None
+        self.track = PoseTrack()
         self._stamp = 0.0  # of the odometry
         self._rests = True  # says the odometry
         self._received = -math.inf
@@ -87,15 +91,36 @@ class CommandOutput:
             back = self._stamp - values[6] if self.odometry is not None else 0.0
             if self._in_lock_step and back > 0.0:
                 self._navigator.time_jumped(f'odometry stamps went back by {back:.4g} s')
+                self.track.cut()
             elif 0.0 < back < REORDERED_S:
                 return
             elif not self._in_lock_step and (jump := self._jump(values, now, back)):
                 self._navigator.odometry_jumped(jump)
+                self.track.cut()
             self.odometry, self._stamp = values[:3], values[6]
+            self.track.add(values[6], values[:3])
             self._rests = not values[3:6].any()
             self._received = now
             self._count += 1
             self._wake.notify_all()
+
+    def pose_at(self, stamp: float) -> np.ndarray | None:
+        """The pose [3] of odometry that belongs to a picture; `wake` is held.
+
+        Who looks at rest gets the newest one: since then the robot has not moved, however the
+        stamps of camera and odometry lie to each other. In motion it is the one at the picture's
+        stamp, or just before it.
+
+        Args:
+            stamp: of the picture [s].
+
+        Returns:
+            x, y [m], yaw [rad] in the frame of the odometry, which is another one where
+            `track.breaks` has grown; None: there is no odometry, or it is silent.
+        """
+        if self.odometry_lost:
+            return None
+        return self.track.at(stamp if self._navigator.continuous else self._stamp, POSE_AGE_S)
 
     def _jump(self, values: np.ndarray, now: float, back: float) -> str:
         """A step in the pose that no driving explains, as a reason; empty: there is none."""

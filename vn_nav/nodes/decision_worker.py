@@ -7,12 +7,14 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Int8, String
 
 from vn_msgs_py import images
+from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.window import Window
@@ -25,6 +27,15 @@ from vn_nav.policy.runtime import PolicyRuntime
 WINDOW_S = 5.0  # that rates and latencies are measured over
 
 
+class Executed(NamedTuple):
+    """What a robot that somebody else drives has done before a picture."""
+
+    stamp: float  # s, of the picture
+    action: int  # -1: none of the policy's
+    pose: np.ndarray | None  # [3] of odometry at the picture
+    says_pose: bool  # else the topic of the odometry does
+
+
 class DecisionWorker:
     """Pictures and goals in, decisions and the statement `arrived` out.
 
@@ -32,6 +43,7 @@ class DecisionWorker:
         node: that publishes `action`, `action_names` and `arrived`.
         navigator: wants the decisions.
         runtime: makes them; only the thread in `run` uses it.
+        output: knows the odometry.
         wake: guards the navigator and what this object keeps.
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
         shadow: decide only after `note_executed`, for a robot that somebody else drives.
@@ -43,11 +55,13 @@ class DecisionWorker:
     """
 
     def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
-                 wake: threading.Condition, *, lock_step: bool, shadow: bool = False):
+                 output: CommandOutput, wake: threading.Condition, *, lock_step: bool,
+                 shadow: bool = False):
         self._node, self._navigator, self._runtime = node, navigator, runtime
-        self._wake, self._lock_step = wake, lock_step
+        self._output, self._wake, self._lock_step = output, wake, lock_step
+        self._breaks = output.track.breaks  # of the odometry, that the runtime knows of
         self._shadow = shadow
-        self._executed: tuple[float, int] | None = None  # stamp [s] and action
+        self._executed: Executed | None = None
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
         self.camera_fov: float | None = None
         self._frame: tuple | None = None  # the newest message, its stamp, when it came
@@ -80,19 +94,22 @@ class DecisionWorker:
             self._goal = message
             self._wake.notify_all()
 
-    def note_executed(self, stamp: float, action: str | None) -> None:
+    def note_executed(self, stamp: float, action: str | None, pose: np.ndarray | None = None, *,
+                      says_pose: bool = False) -> None:
         """What the robot really did before the picture of a stamp, where a decision is wanted.
 
         Args:
             stamp: of the picture; a later one will do [s].
             action: None: none of the policy's.
+            pose: [3] x, y [m], yaw [rad] of odometry at the picture; None: unknown.
+            says_pose: it is to be taken; else that of the topic is.
 
         Raises:
             ValueError: the policy does not know the action.
         """
         number = -1 if action is None else self._runtime.action_names.index(action)
         with self._wake:
-            self._executed = (stamp, number)
+            self._executed = Executed(stamp, number, pose, says_pose)
             if self._frame is None and self._shown is not None and self._shown[1] >= stamp:
                 self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
@@ -179,16 +196,21 @@ class DecisionWorker:
                 self._epoch = self._navigator.epoch
                 self._runtime.reset()
             executed = self._executed if self._shadow else None
-            if self._shadow and (executed is None or stamp < executed[0]):
+            if self._shadow and (executed is None or stamp < executed.stamp):
                 return
             ticket = self._navigator.request(stamp, now)
             if ticket is None:
                 return
+            pose, breaks = self._output.pose_at(stamp), self._output.track.breaks
             if executed is not None:
-                self._runtime.correct(executed[1])
+                self._runtime.correct(executed.action)
                 self._executed = None
+                pose = executed.pose if executed.says_pose else pose
+        if breaks != self._breaks:
+            self._breaks = breaks
+            self._runtime.reset_odometry()
         try:
-            action = self._runtime.act(picture)
+            action = self._runtime.act(picture, pose)
         except FloatingPointError as error:
             with self._wake:
                 self._navigator.stop(str(error), time.monotonic())

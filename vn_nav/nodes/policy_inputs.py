@@ -8,6 +8,7 @@ import math
 import threading
 import time
 
+import numpy as np
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
@@ -107,10 +108,14 @@ class PolicyInputs:
         try:
             executed = json.loads(message.data)
             sec, nanosec = executed['stamp']
-            self._worker.note_executed(sec + nanosec * 1e-9, executed['action'])
+            pose = executed.get('odometry')
+            self._worker.note_executed(
+                sec + nanosec * 1e-9, executed['action'],
+                None if pose is None else _pose(pose), says_pose='odometry' in executed)
         except Exception as error:  # whatever somebody writes there
             self._node.get_logger().error(
-                "executed_action is JSON with stamp [sec, nanosec] and an action's name or null; "
+                "executed_action is JSON with stamp [sec, nanosec], an action's name or null and, "
+                'if anything, odometry [x, y, yaw] or null; '
                 f'received {shorten(message.data)!r}: {shorten(repr(error))}')
 
     def _on_camera_info(self, message: CameraInfo) -> None:
@@ -159,6 +164,13 @@ class PolicyInputs:
                 'inference_ms': _milliseconds(inferences.median(now)),
                 'inference_ms_max': _milliseconds(inferences.largest(now)),
                 'odometry_rate_hz': f'{self._odometry.rate(now):.1f}'}
+
+
+def _pose(values: object) -> np.ndarray:
+    pose = np.array(values, float)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise ValueError('a pose is x, y and yaw')
+    return pose
 
 
 def _milliseconds(seconds: float | None) -> str:

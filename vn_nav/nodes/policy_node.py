@@ -116,7 +116,7 @@ class PolicyNode(LifecycleNode):
             # In a shadow nothing waits for commands: each answers odometry or a decision.
             name=f'shadow/{TOPIC}' if shadow else TOPIC,
             patience=None if shadow else LOCK_STEP_SILENCE_S)
-        self._worker = DecisionWorker(self, self.navigator, runtime, self._wake,
+        self._worker = DecisionWorker(self, self.navigator, runtime, self._output, self._wake,
                                       lock_step=self.lock_step, shadow=shadow)
         self._require_odometry = value['require_odometry']
         self._inputs = PolicyInputs(self, self.navigator, self._worker, self._output, self._wake,

@@ -27,6 +27,7 @@ from vn_nav.observation import needed_side, preprocess, preprocess_map
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import Navigator
+from vn_nav.policy.pose_track import EpisodePose
 from vn_nav.robot import RobotSpec
 
 # What comes with a picture, by the key of `info`: topic and decoder.
@@ -38,6 +39,8 @@ class Seen(NamedTuple):
     """What the robot sees at rest."""
 
     picture: np.ndarray  # [3,S,S] uint8
+    # [3] x, y [m], yaw [rad] by odometry, seen from where the episode began; None: not known
+    odometry: np.ndarray | None
     maps: dict[str, np.ndarray]  # [S,S] depth [m], 0 where unknown; segmentation class ids
 
 
@@ -59,7 +62,7 @@ class Senses:
         node: that subscribes.
         topics: its subscriptions.
         navigator: judges stamps and goals.
-        output: takes odometry.
+        output: takes odometry, and knows which belongs to a picture.
         wake: guards everything below, and wakes all threads.
         robot: whose camera the pictures are cropped to.
         size: side of the pictures [pixels].
@@ -80,8 +83,10 @@ class Senses:
                  output: CommandOutput, wake: threading.Condition, robot: RobotSpec, size: int, *,
                  lock_step: bool, compressed: bool):
         self._node, self._topics, self._navigator, self._wake = node, topics, navigator, wake
+        self._output, self._episode_pose = output, EpisodePose()
         self._robot, self._size, self._lock_step = robot, size, lock_step
         self._goal_watch = GoalWatch(trust_stamps=lock_step)
+        self._knows_pose = False  # once
         self._maps: dict[str, collections.deque] = {}  # (stamp, message) by key
         self.goal: np.ndarray | None = None
         self.goals = 0
@@ -209,15 +214,24 @@ class Senses:
         return (self.frame is not None and self._navigator.wants(self.frame[0])
                 and all(_nearest(rows, self.frame[0]) for rows in self._maps.values()))
 
-    def look(self) -> Seen:
-        """The newest picture, and what belongs to it."""
+    def look(self, *, begins: bool = False) -> Seen:
+        """The newest picture, and what belongs to it.
+
+        Args:
+            begins: an episode begins with it.
+        """
         assert self.frame is not None  # `sees` said so
         stamp, picture = self.frame
+        if begins:
+            self._episode_pose.begin()
+        pose = self._output.pose_at(stamp)
+        self._knows_pose |= pose is not None
+        odometry = self._episode_pose.follow(pose, self._output.track.breaks)
         maps = {}
         for key, rows in self._maps.items():
             decoded = MAP_TOPICS[key][1](_nearest(rows, stamp))
             maps[key] = np.nan_to_num(preprocess_map(decoded, self._size, **self._lens()))
-        return Seen(picture, maps)
+        return Seen(picture, odometry if self._knows_pose else None, maps)
 
     def _prepare(self, message) -> np.ndarray:
         lens = self._lens()

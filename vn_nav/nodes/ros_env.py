@@ -36,6 +36,8 @@ class RosEnv:
     """Visual navigation of real robots, or of simulated ones behind topics; used as a context.
 
     It observes and tells as `vn_sim_bridge`'s `NavigationEnv` does, as far as topics know:
+    `odometry` is observed where all robots publish a pose on `odom`, as a pose seen from where the
+    episode began.
     `info` has `reset`, `success`, `collided`, `arrived` and, where they are published and asked
     for, `depth` and `segmentation`. An episode ends as `episode_end` says; with a reward above 0,
     or `arrived`; where nobody publishes `episode_end` after `max_decisions`; with another
@@ -253,9 +255,11 @@ class RosEnv:
         return number
 
     def _observe(self, seen: list[Seen]) -> dict[str, np.ndarray]:
+        poses = [one.odometry for one in seen if one.odometry is not None]
+        odometry = {'odometry': np.stack(poses)} if len(poses) == len(seen) else {}
         return {'image': np.stack([one.picture for one in seen]),
                 'goal_index': self._goal_index.copy(), 'last_action': self._last_action.copy(),
-                'last_reward': self._last_reward.copy()}
+                'last_reward': self._last_reward.copy(), **odometry}
 
     def _info(self, seen: list[Seen], reset, success, collided, arrived) -> dict[str, np.ndarray]:
         maps = {key: np.stack([one.maps[key] for one in seen]) for key in self.privileged

@@ -199,7 +199,7 @@ class RosRobot(Node):
         with self.wake:
             self._senses.tally = Tally()
             self._episode_goal, self._awaits_goal, self._decisions = self._senses.goals, False, 0
-            self._shown = self._senses.look()
+            self._shown = self._senses.look(begins=True)
         return self._shown
 
     def drive(self, action: int) -> None:

@@ -178,7 +178,8 @@ class Stage:
             self._look_again()
         stamp = max(event.stamp, self._picture_stamp + STAMP_RESOLUTION_NS)
         executed = String(data=json.dumps({'stamp': divmod(stamp, 10**9),
-                                           'action': decision.done}))
+                                           'action': decision.done,
+                                           'odometry': decision.pose}))
         self._out['executed_action'].publish(executed)
         self._bag.write(in_bag('executed_action'), serialize_message(executed), self._log_time)
         self._choice, begun = None, time.monotonic()

@@ -140,6 +140,17 @@ class PolicyRuntime:
         if self._last_action >= 0:  # else an episode begins
             self._last_action = action
 
+    def reset_odometry(self) -> None:
+        """Say that the poses given to `act` from now on are in another frame than those before.
+
+        The odometry jumped or was set anew: how the robot moved between the last picture and the
+        next one, odometry does not tell. The episode goes on. A network has no use for odometry,
+        and forgets nothing; a policy that searches counts on its nominal move.
+        """
+        if self.search is not None:
+            for searcher in self.search.searchers:
+                searcher.reset_odometry()
+
     @property
     def arrived(self) -> bool:
         """Whether the policy declares, at the picture that `act` saw last, that it is there."""
@@ -147,15 +158,25 @@ class PolicyRuntime:
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, odometry: np.ndarray | None = None) -> int:
-        """The next action for a picture, uint8 [3,S,S]; remembered as the last action.
+        """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
         is over, and the next picture begins another one towards the same goal.
 
+        Args:
+            image: the picture, uint8 [3,S,S].
+            odometry: [3] float64 x, y [m], yaw [rad] of the robot there, in any frame that stays
+                the same until `reset_odometry`, `reset` or `set_goal`; what counts is how it
+                changes. None: unknown at this picture; the frame stays. Of use to a policy that
+                searches alone.
+
         Raises:
             FloatingPointError: the outputs are not finite; memory and last action stay.
-            UserError: no goal yet, or a picture of another shape or type.
+            UserError: no goal yet, a picture of another shape or type, or a pose that is none.
         """
+        if odometry is not None and not (odometry.shape == (3,) and np.isfinite(odometry).all()):
+            raise UserError('odometry is x, y and yaw, finite', odometry.tolist(),
+                            'pass None where the pose is unknown')
         if self._goal_maps is None:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])

@@ -17,6 +17,7 @@ import numpy as np
 
 from vn_nav.bags.dataset import DriveSet, Wanted
 from vn_nav.bags.drive_cache import load_drives
+from vn_nav.bags.mapping.pose_graph import between
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.robot import RobotSpec
@@ -130,12 +131,15 @@ def _episode(drives: DriveSet, steps: slice, goal: np.ndarray, checkpoint: Loade
     from vn_nav.policy.runtime import BatchedPolicy
     policy, actions = BatchedPolicy(checkpoint.network, 1, 'greedy'), checkpoint.config.actions
     goals, before = np.array(goal)[None], NO_ACTION
+    # By odometry, or by the commands, in the frame of the episode, as a simulator observes it.
+    own = drives.pose[steps]
+    poses = dict(zip(range(steps.start, steps.stop), between(own[:1], own), strict=True))
     for row in range(steps.start, steps.stop):
         # After a motion that is none of its actions the memory is emptied, as in pre-training.
         observation = {'image': np.array(drives.image[row])[None],
                        'goal_index': np.zeros(1, np.int64),
                        'last_action': np.array([before], np.int64),
-                       'last_reward': np.zeros(1, np.float32)}
+                       'last_reward': np.zeros(1, np.float32), 'odometry': poses[row][None]}
         best = int(policy.act(observation, goals, np.array([before == NO_ACTION]))[0])
         assert policy.logits is not None  # it has just acted
         sure = torch.softmax(policy.logits[0].float(), -1).numpy()

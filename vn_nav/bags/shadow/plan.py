@@ -45,6 +45,7 @@ class Decision(NamedTuple):
     episode: int
     done: str | None  # the action before it; None: an episode's first, or none of the robot's
     last: bool  # of its episode
+    pose: tuple[float, ...] | None  # x, y [m], yaw [rad] by odometry; None: the bag has none
 
 
 class Event(NamedTuple):
@@ -217,7 +218,9 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
         frame = step.frame
         _check_times(bag, int(frame.time * 1e9), int(frame.stamp * 1e9))
         first = not decisions or decisions[-1].episode != frame.episode
-        decisions.append(Decision(frame.time, frame.episode, None if first else done, step.last))
+        decisions.append(Decision(
+            frame.time, frame.episode, None if first else done, step.last,
+            tuple(frame.pose.tolist()) if found.odometry else None))
         done = None if step.action == NO_ACTION else robot.action_names[step.action]
         if step.last:
             goals.keep(frame.episode, frame.goal, frame.image)

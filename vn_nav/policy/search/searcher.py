@@ -85,6 +85,7 @@ class Searcher:
         self.pose = np.zeros(3)
         self.aim, self.arrival = 'look', 0.0
         self._last = -1
+        self._odometry: np.ndarray | None = None
         self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
@@ -94,7 +95,7 @@ class Searcher:
         Args:
             sight: of the newest picture.
             last_action: what was done before it; -1: nothing.
-            odometry: [3] pose, if the robot has odometry; its frame becomes the map's.
+            odometry: [3] pose, if the robot has odometry; what counts is how it changes.
             unmoved: without odometry: the picture is as before the action.
         """
         self._move(last_action, odometry, unmoved)
@@ -107,21 +108,30 @@ class Searcher:
         self._last = action
         return action
 
+    def reset_odometry(self) -> None:
+        """The next odometry is in another frame: the nominal move counts until then."""
+        self._odometry = None
+
     def _move(self, action: int, odometry: np.ndarray | None, unmoved: bool) -> None:
         """Follow the robot on the map, and enter what stopped it."""
         before = self.pose
         move = self.moves[action] if action >= 0 else np.zeros(3)
-        if odometry is not None:
-            self.pose = np.array(odometry, float)
-        elif not (unmoved and np.hypot(*move[:2]) > 0):
-            c, s = math.cos(before[2]), math.sin(before[2])
-            self.pose = np.array([before[0] + c * move[0] - s * move[1],
-                                  before[1] + s * move[0] + c * move[1],
-                                  wrap_angle(before[2] + move[2])])
+        known = odometry is not None and self._odometry is not None
+        if known:
+            c, s = math.cos(self._odometry[2]), math.sin(self._odometry[2])
+            dx, dy = np.asarray(odometry[:2]) - self._odometry[:2]
+            done = np.array([c * dx + s * dy, c * dy - s * dx,
+                             wrap_angle(float(odometry[2] - self._odometry[2]))])
+        else:
+            done = np.zeros(3) if unmoved and np.hypot(*move[:2]) > 0 else move
+        self._odometry = None if odometry is None else np.array(odometry, float)
+        c, s = math.cos(before[2]), math.sin(before[2])
+        self.pose = np.array([before[0] + c * done[0] - s * done[1],
+                              before[1] + s * done[0] + c * done[1],
+                              wrap_angle(before[2] + done[2])])
         wanted = float(np.hypot(*move[:2]))
         if wanted > 0:
-            done = float(np.hypot(*(self.pose - before)[:2]))
-            if done < 0.75 * wanted:
+            if np.hypot(*done[:2]) < 0.75 * wanted:
                 direction = before[2] + math.atan2(move[1], move[0])
                 self.grid.touch(self.pose, direction)
                 self._blocked.append(np.array([*self.pose[:2], direction]))
