@@ -131,8 +131,8 @@ def test_figures_of_a_perfect_eye():
     there = np.array([True, False, False, False, False])
     perfect = Judged(
         np.zeros(5), np.ones(5), np.zeros(5), np.zeros(5), np.array([1, 1, 1, 0, 1.0]),
-        there.astype(float), np.array([0.9, 0.3, 0.4, 0.0, 0.2]), distance, turn, there,
-        np.ones((3, COLUMNS)), dict.fromkeys(sight_training.WEIGHTS, 0.0))
+        there.astype(float), there.astype(float), np.array([0.9, 0.3, 0.4, 0.0, 0.2]),
+        distance, turn, there, np.ones((3, COLUMNS)), dict.fromkeys(sight_training.WEIGHTS, 0.0))
     assert perfect.ring.tolist() == [False, True, True, False, False]
     found = figures(perfect)
     assert set(found) == set(FIGURES)

@@ -20,6 +20,7 @@ from vn_nav.policy.search.look import (
     COLUMNS,
     RANGE_CENTRES,
     RANGE_EDGES,
+    arrival_by_pose,
     column_bearings,
     median_ranges,
     range_classes,
@@ -104,6 +105,22 @@ def test_the_deviation_of_a_heading_is_that_of_its_distribution():
     drawn = torch.distributions.VonMises(torch.zeros(3), kappa).sample((40_000,))
     length = torch.hypot(drawn.cos().mean(0), drawn.sin().mean(0))
     assert torch.allclose(heading_deviation(kappa.log()), torch.sqrt(-2 * length.log()), rtol=0.03)
+
+
+def test_arrival_follows_from_the_pose():
+    random = np.random.default_rng(0)
+    cases = np.array([[0.1, 0.0, 0.1, 5, 5], [0.5, 0.2, 0.4, 25, 20], [0.0, 0.9, 0.3, 0, 10],
+                      [0.3, -0.3, 1.0, -20, 15], [3.0, 0.0, 0.5, 0, 5]])
+    x, y, sigma, turn, spread = cases.T
+    turn, spread = np.radians(turn), np.radians(spread)
+    found = arrival_by_pose(*(torch.from_numpy(part).float() for part in (
+        np.stack([x, y], 1), sigma, np.stack([np.cos(turn), np.sin(turn)], 1), spread)))
+    for k in range(len(cases)):
+        radius = random.gamma(2.0, sigma[k] / math.sqrt(3), 100_000)  # of exp(-r) in the plane
+        angle = random.uniform(0, 2 * math.pi, 100_000)
+        near = np.hypot(x[k] + radius * np.cos(angle), y[k] + radius * np.sin(angle)) <= 0.6
+        ahead = np.abs(random.normal(turn[k], spread[k], 100_000)) <= math.radians(30)
+        assert abs(found[k] - (near & ahead).mean()) < 0.02
 
 
 def test_a_checkpoint_comes_back_and_says_what_it_is(tmp_path):

@@ -11,8 +11,8 @@ import torch
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.learning.auxiliary import POSE_OVERLAP
 from vn_nav.learning.sight_losses import WEIGHTS, range_loss, recognise, recognition_losses
-from vn_nav.policy.search.look import median_ranges
-from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.look import arrival_by_pose, median_ranges
+from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
 
 BATCH = 128  # views
 # The hard ring: nearly there, or there but askew.
@@ -24,8 +24,9 @@ BANDS = {'quarter': (0.25, 0.5), 'half': (0.5, 1.01)}  # shares of the goal pict
 FAR = 1.5  # m: goals beyond are those that a search finds first
 FIGURES = ('loss', *(f'{part}_loss' for part in WEIGHTS), 'bearing_deg', 'far_bearing_deg',
            'far_position_m', *(f'position_m_{band}' for band in BANDS), 'heading_deg',
-           'co_visible_auc', 'arrived_auc', 'arrived_ring_auc', 'co_visible_calibration', 'arrived_calibration',
-           'position_coverage', 'range_error', 'range_within_fifth')
+           'co_visible_auc', 'arrived_auc', 'arrived_ring_auc', 'pose_ring_auc',
+           'co_visible_calibration', 'arrived_calibration', 'position_coverage',
+           'range_error', 'range_within_fifth')
 
 
 class Judged(NamedTuple):
@@ -37,6 +38,7 @@ class Judged(NamedTuple):
     heading_error: np.ndarray  # [K] rad
     co_visible: np.ndarray  # [K] probability
     arrived: np.ndarray  # [K] probability
+    arrived_by_pose: np.ndarray  # [K] probability, by pose and co-visibility alone
     overlap: np.ndarray  # [K] true share of the goal picture in view; negative: unknown
     distance: np.ndarray  # [K] m, true
     turn: np.ndarray  # [K] rad, true, 0 to pi
@@ -76,12 +78,16 @@ def judge(network: SearchPolicy, batch: dict[str, np.ndarray]) -> Judged:
     seen = type(said[0])(*(torch.cat(parts) for parts in zip(*said, strict=True)))
     log_ranges = torch.cat(ranges)
     parts = {**recognition_losses(seen, batch), 'ranges': range_loss(log_ranges, batch['ranges'])}
+    by_pose = torch.sigmoid(seen.co_visible) * arrival_by_pose(
+        seen.position, PER_AXIS * seen.log_scale.exp(), seen.heading,
+        heading_deviation(seen.log_concentration))
     truth = batch['goal_pose']
     position, heading = seen.position.numpy(), seen.heading.numpy()
     return Judged(
         np.hypot(*(position - truth[:, :2]).T), seen.log_scale.exp().numpy(),
         angle_between(position, truth[:, :2]), angle_between(heading, truth[:, 2:]),
         torch.sigmoid(seen.co_visible).numpy(), torch.sigmoid(seen.arrived).numpy(),
+        by_pose.numpy(),
         batch['overlap'], np.hypot(truth[:, 0], truth[:, 1]),
         np.abs(np.arctan2(truth[:, 3], truth[:, 2])), batch['arrived'],
         median_ranges(log_ranges).numpy() / batch['ranges'],
@@ -91,6 +97,7 @@ def judge(network: SearchPolicy, batch: dict[str, np.ndarray]) -> Judged:
 def figures(judged: Judged) -> dict[str, float]:
     """`FIGURES`; NaN where nothing was there to judge by."""
     sees, ring, known = judged.sees, judged.ring, judged.overlap >= 0
+    near = judged.there | ring
     far = sees & (judged.distance > 0.3)  # nearer, a bearing means nothing
     bands = {f'position_m_{name}': _median(judged.position_error[in_band(judged.overlap, band)])
              for name, band in BANDS.items()}
@@ -105,8 +112,8 @@ def figures(judged: Judged) -> dict[str, float]:
         'heading_deg': math.degrees(_median(judged.heading_error[sees])),
         'co_visible_auc': auc(judged.co_visible[known], sees[known]),
         'arrived_auc': auc(judged.arrived, judged.there),
-        'arrived_ring_auc': auc(judged.arrived[judged.there | ring],
-                                judged.there[judged.there | ring]),
+        'arrived_ring_auc': auc(judged.arrived[near], judged.there[near]),
+        'pose_ring_auc': auc(judged.arrived_by_pose[near], judged.there[near]),
         'co_visible_calibration': calibration_error(judged.co_visible[known], sees[known]),
         'arrived_calibration': calibration_error(judged.arrived, judged.there),
         # Of the goals in view, the share that lies in the circle which should hold half of them.

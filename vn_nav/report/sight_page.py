@@ -34,6 +34,8 @@ DEFINITIONS = f"""<h2>Definitions</h2><dl>
 {math.degrees(ARRIVAL_HEADING):g} degrees of where the goal picture was taken.</dd>
 <dt>Hard ring</dt><dd>Pairs that are nearly there: 0.6 to 1.5 m away and turned by no more than 45
 degrees, or within 0.6 m but turned by 30 to 60 degrees.</dd>
+<dt>By the pose alone</dt><dd>The probability of arrival that follows from co-visibility and from
+the distributions of position and heading.</dd>
 <dt>Calibration</dt><dd>Of all pairs that are given a probability of about p a share of p should be
 so. The error is the mean gap.</dd>
 <dt>Half circle</dt><dd>Share of the goals that stand within the circle which, as the network says,
@@ -55,7 +57,8 @@ def sight_page(rows: Sequence[dict], judged: Judged, *, name: str, places: str) 
     some = judged.there | judged.ring
     curves = [('in view', judged.co_visible[known], judged.sees[known]),
               ('arrived', judged.arrived, judged.there),
-              ('arrived, against the hard ring alone', judged.arrived[some], judged.there[some])]
+              ('arrived, against the hard ring alone', judged.arrived[some], judged.there[some]),
+              ('the same, by the pose alone', judged.arrived_by_pose[some], judged.there[some])]
     trained = rows[-1]
     body = f"""<h1>{html.escape(name)}: what it sees</h1>
 <p class="soft">{len(judged.overlap):,} picture pairs of {html.escape(places)}, learned from by

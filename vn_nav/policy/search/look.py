@@ -12,12 +12,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
+
 COLUMNS = 32  # bearings, evenly spaced in picture columns, left to right
 BINS = 24  # of the range; the first is nearer than the first edge, the last farther than the last
 NEAREST, FARTHEST = 0.15, 8.0  # m: the outermost edges
 RANGE_EDGES = np.geomspace(NEAREST, FARTHEST, BINS - 1)  # [BINS-1] m
 _STEP = (FARTHEST / NEAREST) ** (1 / (BINS - 2))
 RANGE_CENTRES = np.geomspace(NEAREST, FARTHEST * _STEP, BINS) / math.sqrt(_STEP)  # [BINS] m
+# Offsets [P,2] with equal shares of a density exp(-r) in the plane, in deviations along an axis.
+_RADII = np.linspace(0, 20, 4001)
+_RADII = np.interp((np.arange(24) + 0.5) / 24, 1 - (1 + _RADII) * np.exp(-_RADII), _RADII)
+_TURNS = 2 * math.pi * (np.arange(24) + 0.5) / 24
+SPREAD = torch.from_numpy(np.stack([np.outer(_RADII, np.cos(_TURNS)), np.outer(
+    _RADII, np.sin(_TURNS))], axis=-1).reshape(-1, 2) / math.sqrt(3)).float()
 
 
 class Look(NamedTuple):
@@ -41,6 +49,19 @@ def column_bearings(fov: float) -> np.ndarray:
     """
     across = 1 - 2 * (np.arange(COLUMNS) + 0.5) / COLUMNS
     return np.arctan(math.tan(fov / 2) * across)
+
+
+def arrival_by_pose(position: Tensor, position_sigma: Tensor, heading: Tensor,
+                    heading_sigma: Tensor) -> Tensor:
+    """Probability [N] that the goal stands within the arrival radius and heading, see `Look`.
+
+    Given that it is in view; as the crow flies, where the rule of arrival is by driving distance.
+    """
+    spots = position.unsqueeze(1) + position_sigma[:, None, None] * SPREAD
+    near = (spots.square().sum(2) <= ARRIVAL_RADIUS**2).float().mean(1)
+    off = torch.atan2(heading[:, 1], heading[:, 0])
+    high, low = ((bound - off) / heading_sigma for bound in (ARRIVAL_HEADING, -ARRIVAL_HEADING))
+    return near * (torch.special.ndtr(high) - torch.special.ndtr(low))
 
 
 def range_classes(ranges: np.ndarray) -> np.ndarray:
