@@ -1,139 +1,23 @@
-"""What every simulator keeps: inherit `Conformance`, write `make`, and its tests run."""
+"""What simulators keep beside `contract.py`: inherit one of these, write `make`, and it runs.
 
-import abc
-import dataclasses
+`Conformance` is for robots that are put anywhere and move by metres, `OwnConformance` for worlds
+with starts and actions of their own.
+"""
 
 import numpy as np
 import pytest
+from contract import GROWTH_MB, ROBOT, SIZE, Contract, resident_mb
 
-from vn_nav.co_visibility import co_visible, lift
 from vn_nav.errors import UserError
-from vn_nav.labels import label_dtype
-from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
-from vn_nav.scenes import parse_scene
 from vn_sim_bridge.counter_random import Stream, key
-from vn_sim_bridge.navigation.env import NavigationEnv
-from vn_sim_bridge.navigation.env_config import EnvConfig
-from vn_sim_bridge.simulator import Capabilities, Simulator
 
-ROBOT = RobotSpec().with_actions(DRIVE_ACTIONS)
-SIZE = 24
-GROWTH_MB = 24  # of 8,000 steps; one leaked picture a step would be 55
+__all__ = ['GROWTH_MB', 'ROBOT', 'SIZE', 'Conformance', 'OwnConformance', 'resident_mb']
 
 
-def resident_mb():
-    with open('/proc/self/status') as status:
-        line = next(line for line in status if line.startswith('VmRSS'))
-    return int(line.split()[1]) / 1024
+class Conformance(Contract):
+    """Of a simulator whose robots are put anywhere (`teleport`) and drive."""
 
-
-class Conformance(abc.ABC):
-    """The contract of `vn_sim_bridge.simulator.Simulator`, as tests."""
-
-    actions = DRIVE_ACTIONS
     contact_slack = 0.02  # m that a robot may still creep towards what it touches
-    depth_slack = 0.9  # share of a picture's points that the same pose sees again
-
-    growth_robots = 4  # that drive 10,000 steps
-    state_slack = 0.0  # of figures, where an engine has its own numbers for a pose
-
-    @abc.abstractmethod
-    def make(self, num_envs, size=SIZE):
-        """A new simulator of `num_envs` robots with pictures of `size` pixels."""
-
-    def config(self, num_envs, **options):
-        """Of an environment about it."""
-        return EnvConfig(num_envs=num_envs, size=SIZE, actions=self.actions, **options)
-
-    def env(self, num_envs=3, **options):
-        return NavigationEnv(self.config(num_envs, **options), ROBOT,
-                             simulator=self.make(num_envs))
-
-    @pytest.fixture
-    def shared(self):
-        """A simulator with its robots at starts, for tests that look alone or put them back."""
-        simulator = self.make(4)
-        yield simulator
-        simulator.close()
-
-    def put(self, simulator, turned=0.0):
-        """Put every robot at a start of its place; the poses [N,4]."""
-        poses = np.zeros((simulator.num_envs, 4))
-        for n in range(simulator.num_envs):
-            cells, headings = simulator.places[simulator.place_index[n]].starts()
-            k = (n * 7919 + 13) % len(cells)
-            poses[n, :2] = cells[k]
-            poses[n, 2] = 0.4 * n if headings is None else headings[k]
-        poses[:, 2] += turned
-        simulator.place(np.arange(simulator.num_envs), poses)
-        return simulator.poses.copy()
-
-    def drive(self, simulator, seed=0, steps=12):
-        """Random moves; all that came of them."""
-        rng, found = np.random.default_rng(seed), []
-        self.put(simulator)
-        for step in range(steps):
-            delta = np.zeros((simulator.num_envs, 4))
-            kind = rng.integers(0, len(ROBOT.actions), simulator.num_envs)
-            for n, action in enumerate(ROBOT.actions[k] for k in kind):
-                delta[n] = action.dx, action.dy, action.dyaw, action.dpitch
-            motion = simulator.move(delta)
-            frames = simulator.observe(keys=key(seed, Stream.SENSOR, np.arange(
-                simulator.num_envs), 0, step))
-            found += [motion.delta.copy(), motion.collided.copy(), simulator.poses.copy(),
-                      *(part.copy() for part in frames)]
-        return found
-
-    def test_it_has_all_of_the_protocol(self, shared):
-        assert isinstance(shared, Simulator)
-        assert isinstance(shared.version, str) and shared.version
-        assert isinstance(shared.capabilities, Capabilities)
-        assert all(type(value) is bool for value in dataclasses.astuple(shared.capabilities))
-        assert not (shared.capabilities.labels and len(shared.label_names) == 0)
-        for split, scenes in getattr(shared, 'splits', {}).items():
-            assert split and len(scenes) and str(parse_scene(scenes[0])) == scenes[0]
-
-    def test_spaces(self, shared):
-        n = shared.num_envs
-        poses = self.put(shared)
-        assert poses.shape == (n, 4) and poses.dtype == np.float64
-        assert shared.place_index.shape == shared.seen_from.shape[:1] == (n,)
-        assert shared.objects.scene.shape == shared.object_models().shape
-        labels = label_dtype(len(shared.label_names))
-        frames = shared.observe()
-        for part, shape, dtype in zip(frames, ((n, 3, SIZE, SIZE), *[(n, SIZE, SIZE)] * 3),
-                                      (np.uint8, np.float32, labels, np.uint16), strict=True):
-            assert part.shape == shape and part.dtype == dtype
-        some = shared.observe(np.array([2, 0]))
-        assert some.rgb.shape == (2, 3, SIZE, SIZE)
-        cameras, fov = shared.cameras()
-        assert cameras.shape == (n, 5) and np.shape(fov) == (n,) and np.isfinite(cameras).all()
-        env = self.env(2)
-        observation, info = env.reset(seed=1)
-        assert env.observation_space.contains(observation)
-        assert np.isfinite(info['distance']).all()
-        env.close()
-
-    def test_places_have_goals_and_starts(self, shared):
-        for place in shared.places:
-            assert str(parse_scene(place.name)) == place.name
-            cells, headings = place.starts()
-            assert cells.ndim == 2 and cells.shape[1] == 2 and np.isfinite(cells).all()
-            assert headings is None or headings.shape == (len(cells),)
-            assert len(place.goals) >= 1
-            goal = place.goals[0]
-            distance = place.distance_to(goal)
-            assert (distance is not None) == shared.capabilities.geodesic
-            if distance is not None:
-                far = distance.at(cells)
-                straight = np.hypot(*(cells - goal.pose[:2]).T)
-                there = np.isfinite(far)
-                assert there.any() and distance.at(np.array([goal.pose]))[0] <= 0.15
-                assert (far[there] >= straight[there] - 0.15).all()
-                assert far[there].max() <= distance.maximum + 0.15
-            plan = place.plan()
-            assert plan is None or {'bounds', 'goals', 'walls', 'outside', 'obstacles',
-                                    'rooms_list', 'area'} <= plan.keys()
 
     def test_robots_are_where_they_are_put(self, shared):
         poses = self.put(shared)
@@ -191,125 +75,66 @@ class Conformance(abc.ABC):
             shared.move(np.array([[0.5, 0.0, 0.0, 0.0]]), np.array([0]))
             assert np.allclose(shared.poses[0, :2], end, atol=1e-3)
 
-    def test_the_same_is_the_same_again(self):
-        one, two = self.make(3), self.make(3)
-        first, second = self.drive(one), self.drive(two)
-        assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
-        assert all(np.array_equal(a, b)
-                   for a, b in zip(self.drive(one), first, strict=True))  # and from the start
-        one.close()
-        two.close()
 
-    def test_a_view_moves_nobody(self, shared):
-        poses = self.put(shared)
-        seen = shared.view(shared.place_index, poses)
-        assert seen.rgb.shape == (4, 3, SIZE, SIZE)
-        assert np.array_equal(shared.poses, poses)
-        assert np.array_equal(seen.rgb, shared.view(shared.place_index, poses).rgb)
+class OwnConformance(Contract):
+    """Of a simulator that begins episodes itself and has actions that are no motions."""
 
-    def test_appearance_is_a_function_of_the_counter(self, shared):
-        self.put(shared)
-        everyone = np.arange(4)
-        shared.apply_appearance(everyone, 5, Stream.APPEARANCE, everyone, 3)
+    def test_it_is_such_a_simulator(self, shared):
+        can = shared.capabilities
+        assert can.own_actions and can.rewards and not can.teleport and not can.continuous
+
+    def test_a_number_begins_the_same_episode_and_no_other(self, shared):
+        numbers = key(3, Stream.START_CELL, np.arange(4), 0)
+        shared.spawn(np.arange(4), numbers)
         first = shared.observe().rgb.copy()
-        shared.apply_appearance(everyone, 6, Stream.APPEARANCE, everyone, 4)
-        shared.apply_appearance(everyone, 5, Stream.APPEARANCE, everyone, 3)
-        assert np.array_equal(shared.observe().rgb, first)
+        self.step(shared, np.arange(4) % len(self.actions))
+        after = shared.observe().rgb.copy()
+        shared.spawn(np.array([2]), numbers[[2]])
+        assert np.array_equal(shared.observe().rgb[2], first[2])
+        assert np.array_equal(shared.observe().rgb[[0, 1, 3]], after[[0, 1, 3]])
+        shared.spawn(np.array([2, 0]), numbers[[2, 0]])
+        assert np.array_equal(shared.observe().rgb[[2, 0]], first[[2, 0]])
 
-    def test_depth_is_of_the_geometry(self, shared):
-        poses = self.put(shared)
-        depth = shared.observe().depth.copy()
-        if not shared.capabilities.depth:
-            assert not depth.any()
-            return
-        assert (depth >= 0).all() and (depth > 0).mean() > 0.5
-        points = lift(depth, *shared.cameras())
-        again = co_visible(points, shared.observe().depth, *shared.cameras())
-        assert (again >= self.depth_slack).all()
-        # A little ahead the same points are nearer, where the map says they are.
-        shared.move(np.array([[0.2, 0.0, 0.0, 0.0]] * 4))
-        ahead = shared.observe().depth
-        moved = np.hypot(*(shared.poses[:, :2] - poses[:, :2]).T) > 0.15
-        share = co_visible(points, ahead, *shared.cameras())
-        assert not moved.any() or np.median(share[moved]) > 0.4
-
-    def test_labels_have_names(self, shared):
+    def test_an_action_is_of_some_robots_and_says_what_came_of_it(self, shared):
         self.put(shared)
-        labels = shared.observe().labels
-        if shared.capabilities.labels:
-            assert labels.max() < len(shared.label_names) and len(np.unique(labels)) > 1
-        else:
-            assert not labels.any()
+        before = shared.observe().rgb.copy()
+        motion = shared.act(np.array([len(self.actions) - 1, 0]), np.array([3, 1]))
+        assert motion.delta.shape == (2, 4) and not motion.delta.any()
+        assert motion.collided.shape == (2,) and motion.collided.dtype == bool
+        assert motion.reward.shape == (2,) and motion.reward.dtype == np.float32
+        assert np.isfinite(motion.reward).all()
+        assert motion.ended.shape == (2,) and motion.ended.dtype == bool
+        after = shared.observe().rgb
+        assert np.array_equal(after[[0, 2]], before[[0, 2]])
+        assert np.array_equal(shared.observe(np.array([3, 1])).rgb, after[[3, 1]])
+        assert not shared.broken_off()[[0, 2]].any()
 
-    def test_what_it_cannot_do_is_refused(self):
-        told = {'depth': ('depth',), 'labels': ('segmentation',), 'walls': ('explorer_action',)}
-        simulator = self.make(2)
-        for name, privileged in told.items():
-            if not getattr(simulator.capabilities, name):
-                with pytest.raises(UserError):
-                    NavigationEnv(self.config(2, privileged=privileged), ROBOT,
-                                  simulator=simulator)
-        if not simulator.capabilities.tilt:
-            with pytest.raises(UserError, match='camera'):
-                NavigationEnv(dataclasses.replace(self.config(2), actions=(
-                    'forward', 'rotate_left', 'look_up')), simulator=simulator)
-        for name, task in (('rooms', 'room'), ('placeable_objects', 'object')):
-            if not getattr(simulator.capabilities, name):
-                with pytest.raises(UserError, match=task):
-                    NavigationEnv(self.config(2, task=task), ROBOT, simulator=simulator)
-        simulator.close()
+    def test_it_puts_nobody_anywhere_and_moves_nobody_by_metres(self, shared):
+        poses = self.put(shared)
+        with pytest.raises(UserError):
+            shared.place(np.arange(4), poses)
+        with pytest.raises(UserError):
+            shared.move(np.zeros((4, 4)))
 
-    def test_episodes_end_and_begin(self):
-        env = self.env(3, max_decisions=4)
-        env.reset(seed=2)
-        ended = np.zeros(3, bool)
-        for step in range(12):
-            _, _, terminated, truncated, info = env.step(np.full(3, step % 2 + 2))
-            assert not (terminated & truncated).any()
-            assert (info['decisions'][truncated] == 4).all()
-            assert info['reset'][ended].all() and not info['reset'][~ended].any()
-            ended = terminated | truncated
-        env.close()
+    def test_its_rewards_and_ends_pass_through(self):
+        """An environment pays and ends what the simulator does, and begins what has ended."""
+        env = self.env(2, max_decisions=10_000)
+        env.reset(seed=4)
+        act, told = env.simulator.act, []
 
-    def test_a_state_goes_on_as_before(self):
-        one, two = self.env(3, max_decisions=9), self.env(3, max_decisions=9)
-        assert one.restorable
-        rng = np.random.default_rng(4)
-        one.reset(seed=3)
-        for _ in range(5):
-            one.step(rng.integers(0, len(self.actions), 3))
-        two.reset(seed=8)
-        two.set_state(one.get_state())
-        for _ in range(14):
-            actions = rng.integers(0, len(self.actions), 3)
-            (a, reward, *ends, told), (b, other, *also, too) = one.step(actions), two.step(actions)
-            assert all(np.array_equal(a[name], b[name]) for name in a)
-            assert np.array_equal(reward, other) and np.array_equal(ends, also)
-            assert all(np.allclose(told[name], too[name], rtol=0, atol=self.state_slack)
-                       for name in told)
-        one.close()
-        two.close()
-
-    def test_it_closes_once_and_for_all(self):
-        simulator, calls = self.make(2), []
-        close = simulator.close
-        simulator.close = lambda: (calls.append(1), close())
-        env = NavigationEnv(self.config(2), ROBOT, simulator=simulator)
-        env.close()
-        env.close()
-        assert calls == [1]
-        close()  # a second time it does nothing
-
-    @pytest.mark.slow
-    @pytest.mark.timeout(600)
-    def test_ten_thousand_steps_do_not_grow(self):
-        robots = self.growth_robots
-        env = self.env(robots, max_decisions=50)
-        env.reset(seed=0)
-        rng = np.random.default_rng(0)
-        for step in range(10_000):
-            env.step(rng.integers(0, len(self.actions), robots))
-            if step == 2_000:
-                begun = resident_mb()
-        assert resident_mb() - begun < GROWTH_MB
+        def listened(actions, env_ids):
+            told.append((env_ids, act(actions, env_ids)))
+            return told[-1][1]
+        env.simulator.act = listened
+        rng, over = np.random.default_rng(0), np.zeros(2, bool)
+        for _ in range(40):
+            told.clear()
+            _, reward, terminated, truncated, info = env.step(
+                rng.integers(0, len(self.actions), 2))
+            paid, ended = np.zeros(2, np.float32), np.zeros(2, bool)
+            for env_ids, motion in told:
+                paid[env_ids], ended[env_ids] = motion.reward, motion.ended
+            assert np.array_equal(reward, paid) and np.array_equal(terminated, ended)
+            assert np.array_equal(info['reset'], over), 'the step after an end begins anew'
+            over = terminated | truncated
         env.close()

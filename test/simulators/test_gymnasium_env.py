@@ -1,12 +1,14 @@
 """Gymnasium environments as scenes: native actions, rewards and ends; figures without ways."""
 
 import contextlib
+import functools
 import importlib.util
 import json
 
 import gymnasium
 import numpy as np
 import pytest
+from conformance import SIZE, OwnConformance
 from gymnasium import spaces
 
 from vn_nav import cli
@@ -20,7 +22,7 @@ from vn_nav.robot import RobotSpec
 from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
 from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
-from vn_sim_bridge.simulator import Setup, Simulator
+from vn_sim_bridge.simulator import Setup
 from vn_sim_bridge.simulators import open_simulator, robot_for
 
 CORRIDOR = 'test/Corridor-v0'
@@ -88,6 +90,23 @@ def registered():
         del gymnasium.registry[name]
 
 
+class Own(OwnConformance):
+    """The contract, of one or more scenes; their actions are the robot's."""
+
+    scenes = (SCENE,)
+
+    @functools.cached_property
+    def robot(self):  # asking for it starts an environment
+        return robot_for(self.scenes)
+
+    def make(self, num_envs, size=SIZE):
+        return open_simulator(self.scenes, Setup(num_envs, self.robot, size))
+
+
+class TestGym(Own):
+    scenes = (SCENE, 'gym:test/Render-v0')
+
+
 def env_of(scene=SCENE, **options):
     return NavigationEnv(EnvConfig(scenes=(scene,), **{'num_envs': 4, 'size': 24} | options))
 
@@ -135,17 +154,8 @@ def test_the_same_seed_is_the_same_again():
     assert np.array_equal(*found)
 
 
-def test_it_has_all_of_the_protocol_and_refuses_the_rest():
-    simulator = open_simulator([SCENE], Setup(2, robot_for([SCENE]), 24))
-    assert isinstance(simulator, Simulator)
-    for refused in (lambda: simulator.move(np.zeros((2, 4))),
-                    lambda: simulator.place(np.arange(2), np.zeros((2, 4)))):
-        with pytest.raises(UserError):
-            refused()
-    simulator.close()
-    simulator.close()
-    for options in ({'task': 'collect'}, {'stop': 'declared'}, {'privileged': ('depth',)},
-                    {'privileged': ('oracle_action',)}, {'progress_reward': 1.0},
+def test_what_it_has_not_is_refused():
+    for options in ({'task': 'collect'}, {'privileged': ('oracle_action',)},
                     {'actions': ('forward', 'left')}):
         with pytest.raises(UserError):
             env_of(**options)
@@ -153,7 +163,6 @@ def test_it_has_all_of_the_protocol_and_refuses_the_rest():
     seen, _ = env.reset(seed=0)
     moved = env.step(np.zeros(4, int))[0]['image'][:, 0, 0, 0] - seen['image'][:, 0, 0, 0]
     assert (moved == 40).all()
-    assert not env.restorable
     env.close()
     with pytest.raises(UserError, match='actions of its own'):  # of no house
         NavigationEnv(EnvConfig(num_envs=1), robot_for([SCENE]))
@@ -234,18 +243,43 @@ REAL = [('gym:MiniWorld-Hallway-v0', 'miniworld', 'turn_left'),
         ('gym:VizdoomBasic-v1', 'vizdoom', 'attack')]
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(300)
-@pytest.mark.parametrize('scene, module, action', REAL)
-def test_the_real_ones_step(scene, module, action):
+def real(scene, module):
+    """An environment of an extra, if this machine has it and what it draws with."""
     if importlib.util.find_spec(module) is None:
         pytest.skip(f'expected: {module} is an extra of its own')
     try:
-        env = env_of(scene, num_envs=3, size=42)
+        return env_of(scene, num_envs=3, size=42)
     except UserError as error:
         if 'ImportError' in str(error) or 'NoSuchConfig' in str(error):
             pytest.skip(f'expected: no OpenGL here ({error})')
         raise
+
+
+class RealOne(Own):
+    growth_robots = 1
+
+    @classmethod
+    def setup_class(cls):
+        real(cls.scenes[0], cls.module).close()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+class TestMiniWorld(RealOne):
+    scenes, module = (REAL[0][0],), REAL[0][1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+class TestVizdoom(RealOne):
+    scenes, module = (REAL[1][0],), REAL[1][1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize('scene, module, action', REAL)
+def test_the_real_ones_step(scene, module, action):
+    env = real(scene, module)
     assert action in env.action_names
     first = env.reset(seed=1)[0]['image'].copy()
     assert np.array_equal(env.reset(seed=1)[0]['image'], first)  # of equal seeds

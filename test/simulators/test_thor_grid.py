@@ -91,13 +91,12 @@ class TestGrid(Conformance):
     """The contract of every simulator."""
 
     @pytest.fixture(autouse=True)
-    def _robot(self, dump, monkeypatch):
+    def _robot(self, dump):
         self.path = dump[0]
-        monkeypatch.setattr('conformance.ROBOT', robot_for([scene(self.path)]))
+        self.robot = robot_for([scene(self.path)])
 
     def make(self, num_envs, size=24):
-        return open_simulator([scene(self.path)], Setup(
-            num_envs, robot_for([scene(self.path)]), size))
+        return open_simulator([scene(self.path)], Setup(num_envs, self.robot, size))
 
 
 def test_a_dump_is_read_as_it_was_written(dump):

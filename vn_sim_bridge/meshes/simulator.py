@@ -13,31 +13,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from vn_nav.scenes import SceneName
-from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.floor.contacts import move_among, reach_among
 from vn_sim_bridge.houses.objects import object_scene
 from vn_sim_bridge.meshes.lazy import BUDGET, LazyPlace, PlaceCache
 from vn_sim_bridge.meshes.place import MeshPlace
+from vn_sim_bridge.render.drawn import DrawnSimulator
 from vn_sim_bridge.render.pack import Lights
-from vn_sim_bridge.render.randomisation import Appearance, Randomisation, draw_appearance
+from vn_sim_bridge.render.randomisation import Appearance
 from vn_sim_bridge.render.rasterizer import Rasterizer
 from vn_sim_bridge.render.scene import Scene
-from vn_sim_bridge.render.sensor import expose
-from vn_sim_bridge.simulator import (
-    BaseSimulator,
-    Capabilities,
-    Frames,
-    Motion,
-    Objects,
-    Placed,
-    Setup,
-    no_objects,
-)
+from vn_sim_bridge.simulator import Frames, Motion, Objects, Setup, no_objects
 
 Maker = Callable[[], tuple[MeshPlace, Scene]]
 
 
-class MeshSimulator(BaseSimulator):
+class MeshSimulator(DrawnSimulator):
     """N robots in meshes. A subclass writes `open`: it names its places and how each is read.
 
     Every place is a `floor.places.RoomPlace`. A robot's place stays in memory; others as far as
@@ -52,9 +42,6 @@ class MeshSimulator(BaseSimulator):
         budget: bytes of places that are kept though no robot is in them.
     """
 
-    capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True,
-                                rooms=True, walls=True, placeable_objects=True, appearance=True,
-                                other_goals=True)
     places: list[LazyPlace]
 
     @classmethod
@@ -70,10 +57,7 @@ class MeshSimulator(BaseSimulator):
         self.label_names = tuple(label_names)
         if not rooms:
             self.capabilities = dataclasses.replace(self.capabilities, rooms=False)
-        self.randomisation = setup.randomisation or Randomisation()
-        self.objects = no_objects(setup.num_envs, setup.objects)
-        self._appearance = self.appearance(0, Stream.APPEARANCE, self._all, 0 * self._all)
-        self._frames: Frames | None = None
+        self._set_up(setup.randomisation, setup.objects)
         self._use()
         for index in sorted(set(self.place_index.tolist())):  # what is wrong is said now
             self.cache.get(index)
@@ -103,62 +87,13 @@ class MeshSimulator(BaseSimulator):
         return reach_among(rects, self.robot.footprint_radius, x, y, np.asarray(headings, float),
                            length)
 
-    def appearance(self, seed: int | np.ndarray, stream: Stream, env, episode) -> Appearance:
-        """Light and camera of some episodes, or of some goal pictures."""
-        return draw_appearance(self.randomisation, 1, seed, stream, env, episode)
+    @property
+    def _lamps(self) -> int:
+        return 1  # all rooms have the same
 
-    def apply_appearance(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream,
-                         env, episode) -> None:
-        """Draw light and camera of robots [K] anew, by the counters [K] of their episodes."""
-        for part, rows in zip(self._appearance, self.appearance(seed, stream, env, episode),
-                              strict=True):
-            part[env_ids] = rows
-
-    def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
-        """Put these objects, and no others, about one robot."""
-        _stand(self.objects, env_id, placed)
-
-    def object_models(self) -> np.ndarray:
-        """[N,M] int64: which model each object is; -1: absent."""
-        return np.where(self.objects.scene >= 0, self.objects.scene - 1, -1)
-
-    def observe(self, env_ids: np.ndarray | None = None,
-                keys: np.ndarray | None = None) -> Frames:
-        """See `Simulator`."""
-        if env_ids is None:
-            self._frames = self._draw(self.place_index, self.poses, self._frames,
-                                      self._appearance, keys, self.objects)
-            return self._frames
-        return self._draw(self.place_index[env_ids], self.poses[env_ids], None,
-                          Appearance(*(part[env_ids] for part in self._appearance)), keys,
-                          Objects(*(part[env_ids] for part in self.objects)))
-
-    def view(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
-             appearance: Appearance | None = None, keys: np.ndarray | None = None,
-             placed: Sequence[Sequence[Placed]] | None = None) -> Frames:
-        """See `Simulator`; by default in standard light."""
-        if appearance is None:
-            appearance = draw_appearance(Randomisation(), 1, 0, Stream.APPEARANCE,
-                                         np.arange(len(poses)), 0)
-        objects = no_objects(len(poses), max(map(len, placed or [()])))
-        for k, items in enumerate(placed or ()):
-            _stand(objects, k, items)
-        return self._draw(np.asarray(place_index), np.asarray(poses, float), out, appearance, keys,
-                          objects)
-
-    def cameras(self, poses: np.ndarray | None = None, appearance: Appearance | None = None
-                ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Simulator`."""
-        robot = self.robot
-        poses = self.poses if poses is None else poses
-        appearance = appearance or self._appearance
-        cameras = np.column_stack([poses[:, :2], robot.camera_height + appearance.height,
-                                   poses[:, 2],
-                                   poses[:, 3] + robot.camera_pitch + appearance.pitch])
-        return cameras, robot.camera_fov + appearance.fov
-
-    def _draw(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None,
-              appearance: Appearance, keys: np.ndarray | None, objects: Objects) -> Frames:
+    def _render(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None,
+                appearance: Appearance, objects: Objects | None) -> Frames:
+        objects = no_objects(len(poses)) if objects is None else objects
         cameras, fov = self.cameras(poses, appearance)
         frames = out or _buffers(len(poses), self.setup.size)
         lights = Lights(appearance.cube, appearance.lamps)
@@ -176,10 +111,6 @@ class MeshSimulator(BaseSimulator):
                 objects=Objects(*(part[rows] for part in objects)))
             for whole, part in zip(frames, drawn, strict=True):
                 whole[rows] = part
-        if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:
-            if keys is None:
-                keys = np.arange(len(poses)).astype(np.uint64)
-            expose(frames.rgb, appearance.noise, appearance.blur, keys)
         return frames
 
     def close(self) -> None:
@@ -198,14 +129,6 @@ def _by_place(place_index: np.ndarray) -> list[tuple[int, np.ndarray]]:
     """The places of some robots [K], and the rows of each."""
     return [(int(index), np.nonzero(place_index == index)[0])
             for index in np.unique(place_index)]
-
-
-def _stand(objects: Objects, row: int, placed: Sequence[Placed]) -> None:
-    objects.scene[row] = -1
-    for m, item in enumerate(placed):
-        objects.scene[row, m] = 1 + item.model  # 0 is the place itself
-        objects.pose[row, m] = item.x, item.y, 0.0, item.yaw
-        objects.room[row, m] = 0
 
 
 def _buffers(count: int, size: int) -> Frames:

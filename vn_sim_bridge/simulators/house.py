@@ -9,27 +9,17 @@ import numpy as np
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import ROOMS, SceneName, house_scene, options_of, whole_number
-from vn_sim_bridge.counter_random import Stream
 from vn_sim_bridge.floor.contacts import World
 from vn_sim_bridge.houses.house import House
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.houses.objects import GOAL_OBJECTS, object_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.splits import SPLITS
+from vn_sim_bridge.render.drawn import DrawnSimulator
 from vn_sim_bridge.render.pack import Lights
-from vn_sim_bridge.render.randomisation import Appearance, Randomisation, draw_appearance
+from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.render.rasterizer import Rasterizer
-from vn_sim_bridge.render.sensor import expose
-from vn_sim_bridge.simulator import (
-    BaseSimulator,
-    Capabilities,
-    Frames,
-    Motion,
-    Objects,
-    Placed,
-    Setup,
-    no_objects,
-)
+from vn_sim_bridge.simulator import Frames, Motion, Setup
 
 
 class ScenesBySeed(Sequence):
@@ -65,7 +55,7 @@ def open_houses(scenes: Sequence[SceneName], goals_per_room: int = 1, goal_seed:
 WORLD_VERSION = '2'
 
 
-class HouseSimulator(BaseSimulator):
+class HouseSimulator(DrawnSimulator):
     """N robots in embedded houses (see `Simulator`).
 
     Args:
@@ -79,9 +69,6 @@ class HouseSimulator(BaseSimulator):
         models: names of the objects that may stand in the houses; objects: most at a time.
     """
 
-    capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True, tilt=True,
-                                rooms=True, walls=True, placeable_objects=True, appearance=True,
-                                other_goals=True)
     places: list[House]
     version = WORLD_VERSION
     label_names = LABELS
@@ -111,14 +98,10 @@ class HouseSimulator(BaseSimulator):
         # One array each, in the world and here: a move changes both.
         self.poses, self.place_index = self.world.poses, self.world.place_index
         self.num_envs = len(self.place_index)
-        self.randomisation = randomisation or Randomisation()
         self._renderer: Rasterizer | None = Rasterizer(  # None: closed
             [*(house.scene for house in self.places), *map(object_scene, models)], size,
             threads=threads)
-        self.objects = no_objects(self.num_envs, objects)
-        self._all = np.arange(self.num_envs)
-        self._frames: Frames | None = None
-        self._appearance = self.appearance(0, Stream.APPEARANCE, self._all, 0 * self._all)
+        self._set_up(randomisation, objects)
 
     @property
     def _painter(self) -> Rasterizer:
@@ -133,97 +116,22 @@ class HouseSimulator(BaseSimulator):
         """Where a translation of `length` [m] along each heading [rad] would end, [K,2] m."""
         return self.world.reach(env_id, headings, length)
 
-    def appearance(self, seed: int | np.ndarray, stream: Stream, env, episode) -> Appearance:
-        """Light and camera of some episodes, or of some goal pictures."""
-        return draw_appearance(self.randomisation, self._painter.rooms, seed, stream, env,
-                               episode)
+    @property
+    def _lamps(self) -> int:
+        return self._painter.rooms
 
-    def apply_appearance(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream,
-                         env, episode) -> None:
-        """Draw light and camera of robots [K] anew, for the counters [K] of their episodes."""
-        drawn = self.appearance(seed, stream, env, episode)
-        for part, rows in zip(self._appearance, drawn, strict=True):
-            part[env_ids] = rows
+    @property
+    def _first_model(self) -> int:
+        return len(self.places)
 
-    def set_objects(self, env_id: int, placed: Sequence[Placed]) -> None:
-        """Put these objects, and no others, into the house of one robot."""
-        self._stand(self.objects, env_id, self.world.place_index[env_id], placed)
+    def _room_index(self, place_index: int, x: float, y: float) -> int:
+        return self.places[place_index].room_index(x, y)
 
-    def _stand(self, objects: Objects, row: int, place_index: int, placed: Sequence[Placed]
-               ) -> None:
-        house = self.places[place_index]
-        objects.scene[row] = -1
-        for m, item in enumerate(placed):
-            objects.scene[row, m] = len(self.places) + item.model
-            objects.pose[row, m] = item.x, item.y, 0.0, item.yaw
-            objects.room[row, m] = house.room_index(item.x, item.y)
-
-    def object_models(self) -> np.ndarray:
-        """[N,M] int64: which model each object is; -1: absent."""
-        return np.where(self.objects.scene >= 0, self.objects.scene - len(self.places), -1)
-
-    def observe(self, env_ids: np.ndarray | None = None,
-                keys: np.ndarray | None = None) -> Frames:
-        """Pictures of the robots' cameras. All robots: one buffer, valid until the next call.
-
-        Args:
-            env_ids: [K] which robots; default all.
-            keys: [K] uint64, of the sensor's noise; default: one noise for every call.
-        """
-        if env_ids is None:
-            self._frames = self._draw(self.world.place_index, self.world.poses, self._frames,
-                                      self._appearance, keys, self.objects)
-            return self._frames
-        return self._draw(self.world.place_index[env_ids], self.world.poses[env_ids], None,
-                          Appearance(*(part[env_ids] for part in self._appearance)), keys,
-                          Objects(*(part[env_ids] for part in self.objects)))
-
-    def view(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None = None,
-             appearance: Appearance | None = None, keys: np.ndarray | None = None,
-             placed: Sequence[Sequence[Placed]] | None = None) -> Frames:
-        """Pictures from any poses [K,4] in houses [K]; by default in standard light.
-
-        Args:
-            out: buffers to fill; keys: as in `observe`.
-            appearance: light and camera of each picture.
-            placed: the objects in each picture; default none.
-        """
-        if appearance is None:
-            appearance = draw_appearance(Randomisation(), self._painter.rooms, 0,
-                                         Stream.APPEARANCE, np.arange(len(poses)), 0)
-        objects = None
-        if placed is not None:
-            objects = no_objects(len(poses), max(map(len, placed)))
-            for k, items in enumerate(placed):
-                self._stand(objects, k, place_index[k], items)
-        return self._draw(place_index, poses, out, appearance, keys, objects)
-
-    def cameras(self, poses: np.ndarray | None = None, appearance: Appearance | None = None
-                ) -> tuple[np.ndarray, np.ndarray]:
-        """Where cameras are and look, [K,5] as `Rasterizer.render` takes them, and their fov [K].
-
-        Args:
-            poses: [K,4] of the robots that hold them; default: the robots as they stand now.
-            appearance: of each picture; default: that of the robots' episodes.
-        """
-        robot = self.robot
-        poses = self.world.poses if poses is None else poses
-        appearance = appearance or self._appearance
-        cameras = np.column_stack([poses[:, :2], robot.camera_height + appearance.height,
-                                   poses[:, 2],
-                                   poses[:, 3] + robot.camera_pitch + appearance.pitch])
-        return cameras, robot.camera_fov + appearance.fov
-
-    def _draw(self, place_index, poses, out, appearance, keys, objects) -> Frames:
+    def _render(self, place_index, poses, out, appearance, objects) -> Frames:
         cameras, fov = self.cameras(poses, appearance)
-        frames = Frames(*self._painter.render(
+        return Frames(*self._painter.render(
             place_index, cameras, fov, out,
             lights=Lights(appearance.cube, appearance.lamps), objects=objects))
-        if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:
-            if keys is None:
-                keys = np.arange(len(poses)).astype(np.uint64)
-            expose(frames.rgb, appearance.noise, appearance.blur, keys)
-        return frames
 
     def close(self) -> None:
         """Let go of the pictures and of what the renderer holds."""
