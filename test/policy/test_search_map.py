@@ -1,15 +1,15 @@
-"""The map of the policy `search`, ways on it, and hypotheses of where the goal is."""
+"""The map of the policy `search`, costmap on it, and hypotheses of where the goal is."""
 
 import math
 
 import numpy as np
 import pytest
 
-from vn_nav.policy.search.grid import CELL, SIDE, Grid
+from vn_nav.policy.search.costmap import Costmap
+from vn_nav.policy.search.grid import CELL, SIDE, OccupancyGrid
 from vn_nav.policy.search.hypotheses import Hypotheses, apart, on_map
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, column_bearings
 from vn_nav.policy.search.searcher import Searcher, Sight
-from vn_nav.policy.search.ways import Ways
 
 BEARINGS = column_bearings(math.pi / 2)
 MOVES = ((0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, math.pi / 6), (0.0, 0.0, -math.pi / 6))
@@ -37,10 +37,10 @@ def room(pose, half=2.0):
 
 def looked_around(grid=None, place=(0.0, 0.0)):
     """A grid that knows the room."""
-    grid = grid or Grid(0.25)
+    grid = grid or OccupancyGrid(0.25)
     for yaw in np.arange(12) * math.pi / 6:
         pose = np.array([*place, yaw])
-        grid.stand(pose)
+        grid.add_footprint(pose)
         grid.add_ranges(pose, BEARINGS, one_hot(room(pose)), RANGE_EDGES)
     return grid
 
@@ -52,7 +52,7 @@ def sight(**changes):
 
 
 def test_a_wall_is_occupied_before_it_is_free_and_behind_it_is_unknown():
-    grid = Grid(0.25)
+    grid = OccupancyGrid(0.25)
     for _ in range(3):
         grid.add_ranges(np.zeros(3), BEARINGS, one_hot(wall_ahead(2.0)), RANGE_EDGES)
     row, _ = grid.cell(0.0, 0.0)
@@ -65,61 +65,62 @@ def test_a_wall_is_occupied_before_it_is_free_and_behind_it_is_unknown():
 
 
 def test_a_doubtful_range_marks_nothing_as_an_obstacle():
-    grid = Grid(0.25)
+    grid = OccupancyGrid(0.25)
     grid.add_ranges(np.zeros(3), BEARINGS, np.full((COLUMNS, BINS), 1 / BINS), RANGE_EDGES)
     assert not grid.obstacles().any()
 
 
 def test_where_the_robot_stood_is_free_and_where_it_was_stopped_is_not():
-    grid = Grid(0.25)
-    grid.touch(np.zeros(3), 0.0)
+    grid = OccupancyGrid(0.25)
+    grid.add_contact(np.zeros(3), 0.0)
     assert grid.obstacles()[grid.cell(0.3, 0.0)]
     for _ in range(3):  # no look clears a contact
         grid.add_ranges(np.zeros(3), BEARINGS, one_hot(wall_ahead(3.0)), RANGE_EDGES)
     assert grid.obstacles()[grid.cell(0.3, 0.0)]
-    grid.stand(np.array([0.3, 0.0, 0.0]))  # but standing there does
+    grid.add_footprint(np.array([0.3, 0.0, 0.0]))  # but standing there does
     assert not grid.obstacles()[grid.cell(0.3, 0.0)]
 
 
 def test_the_map_moves_along_with_the_robot():
-    grid = Grid(0.25)
+    grid = OccupancyGrid(0.25)
     grid.add_ranges(np.zeros(3), BEARINGS, one_hot(wall_ahead(2.0)), RANGE_EDGES)
     before = grid.log_odds[grid.cell(1.0, 0.0)]
-    grid.stand(np.array([11.0, 0.0, 0.0]))
+    grid.add_footprint(np.array([11.0, 0.0, 0.0]))
     assert grid.origin[0] > -CELL * SIDE / 2
     assert grid.log_odds[grid.cell(1.0, 0.0)] == before < 0
-    grid.stand(np.array([40.0, 0.0, 0.0]))  # farther than its side: all is forgotten
+    grid.add_footprint(np.array([40.0, 0.0, 0.0]))  # farther than its side: all is forgotten
     assert not grid.log_odds.any()
 
 
-def test_ways_keep_the_footprint_off_obstacles_and_go_round_them():
+def test_costmap_keep_the_footprint_off_obstacles_and_go_round_them():
     grid = looked_around()
-    ways = Ways(grid)
-    assert ways.passable[grid.cell(0.0, 0.0)] and not ways.passable[grid.cell(1.9, 0.0)]
+    costmap = Costmap(grid)
+    assert costmap.passable[grid.cell(0.0, 0.0)] and not costmap.passable[grid.cell(1.9, 0.0)]
     goal = np.array([grid.cell(1.0, 0.0)])
     here = grid.cell(-1.0, 0.0)
-    straight = ways.to(goal, np.zeros(1), here, through_unknown=False)[here]
+    straight = costmap.cost_to_go(goal, np.zeros(1), here, through_unknown=False)[here]
     assert straight == pytest.approx(2.0, abs=0.15)
     for y in np.arange(-0.6, 0.61, CELL):  # a wall of contacts across the way
-        grid.touch(np.array([-0.3, y, 0.0]), 0.0)
-    ways = Ways(grid)
-    around = ways.to(goal, np.zeros(1), here, through_unknown=False)[here]
+        grid.add_contact(np.array([-0.3, y, 0.0]), 0.0)
+    costmap = Costmap(grid)
+    around = costmap.cost_to_go(goal, np.zeros(1), here, through_unknown=False)[here]
     assert straight + 0.5 < around < straight + 3.0
-    got, _ = ways.cut(-1.0, 0.0, 0.0, 1.5)
-    assert got < 1.0 and ways.cut(-1.0, 0.0, math.pi / 2, 0.5)[0] == 0.5
+    got, _ = costmap.free_length(np.array([-1.0, 0.0, 0.0]), 0.0, 1.5)
+    assert got < 1.0
+    assert costmap.free_length(np.array([-1.0, 0.0, 0.0]), math.pi / 2, 0.5)[0] == 0.5
 
 
 def test_an_opening_in_the_wall_is_a_frontier_and_a_whole_room_has_none():
-    assert len(Ways(looked_around()).frontiers()[0]) == 0
-    grid = Grid(0.25)
+    assert len(Costmap(looked_around()).frontiers()[0]) == 0
+    grid = OccupancyGrid(0.25)
     for yaw in np.arange(12) * math.pi / 6:
         pose = np.array([0.0, 0.0, yaw])
         ranges = room(pose)
         open_door = np.abs(np.sin(yaw + BEARINGS)) < 0.35
         ranges[open_door & (np.cos(yaw + BEARINGS) > 0)] = 7.0
-        grid.stand(pose)
+        grid.add_footprint(pose)
         grid.add_ranges(pose, BEARINGS, one_hot(ranges), RANGE_EDGES)
-    cells, head_start = Ways(grid).frontiers()
+    cells, head_start = Costmap(grid).frontiers()
     x = grid.origin[0] + (cells[:, 1] + 0.5) * CELL
     assert len(cells) and (x > 1.5).all() and (head_start > 0).all()
 
@@ -129,9 +130,9 @@ def test_what_looks_never_show_is_no_more_looked_for():
     row, column = grid.cell(1.0, 1.0)
     hole = slice(row - 1, row + 2), slice(column - 1, column + 2)
     grid.seen[hole] = 0  # no picture fills it
-    assert grid.look_gains(0.0, 0.0, np.array([math.pi / 4]), BEARINGS)[0] > 0
+    assert grid.look_gains(np.zeros(3), np.array([math.pi / 4]), BEARINGS)[0] > 0
     grid.missed[hole] = 3
-    assert grid.look_gains(0.0, 0.0, np.array([math.pi / 4]), BEARINGS)[0] == 0
+    assert grid.look_gains(np.zeros(3), np.array([math.pi / 4]), BEARINGS)[0] == 0
     assert not grid.unknown()[grid.cell(1.0, 1.0)]
     grid.forget_looks()
     assert grid.unknown()[grid.cell(1.0, 1.0)] and grid.obstacles().any()
@@ -194,7 +195,7 @@ def test_without_odometry_it_counts_on_its_moves_and_sees_that_it_stood_still():
     own.step(sight(), LEFT, None)
     own.step(sight(), FORWARD, None, unmoved=True)
     np.testing.assert_allclose(own.pose, [0.5, 0.0, math.pi / 6])
-    assert own.grid.touched.any()
+    assert own.grid.contacts.any()
 
 
 def test_odometry_counts_by_its_changes_and_gaps_by_the_nominal_moves():
@@ -210,9 +211,9 @@ def test_odometry_counts_by_its_changes_and_gaps_by_the_nominal_moves():
     own.step(sight(), FORWARD, np.array([0.45, 0.0, 0.0]))
     np.testing.assert_allclose(own.pose, [1.4 + 0.45 * math.cos(math.pi / 6), 0.225, math.pi / 6],
                                atol=1e-9)
-    assert not own.grid.touched.any()
+    assert not own.grid.contacts.any()
     own.step(sight(), FORWARD, np.array([0.5, 0.0, 0.0]))
-    assert own.grid.touched.any()
+    assert own.grid.contacts.any()
 
 
 def test_a_move_that_met_something_is_not_tried_again_there():

@@ -26,7 +26,7 @@ MISSES = 3  # looks that should have shown a cell by the map, and did not: it is
 VIEW = 2.5  # m to which a look is expected to show floor
 
 
-class Grid:
+class OccupancyGrid:
     """The map of one robot.
 
     Args:
@@ -37,7 +37,7 @@ class Grid:
         seen: [SIDE,SIDE] float32: looks that passed or ended here, in expectation.
         missed: [SIDE,SIDE] int16: looks that should have shown it, by the map, and did not.
         stood: [SIDE,SIDE] bool: the robot was on it; been: its centre was.
-        touched: [SIDE,SIDE] bool: it met something here.
+        contacts: [SIDE,SIDE] bool: it met something here.
         origin: [2] m, of the lower left corner.
     """
 
@@ -48,7 +48,7 @@ class Grid:
         self.missed = np.zeros((SIDE, SIDE), np.int16)
         self.stood = np.zeros((SIDE, SIDE), bool)
         self.been = np.zeros((SIDE, SIDE), bool)
-        self.touched = np.zeros((SIDE, SIDE), bool)
+        self.contacts = np.zeros((SIDE, SIDE), bool)
         self.origin = np.array([-CELL * SIDE / 2, -CELL * SIDE / 2])
 
     def add_ranges(self, pose: np.ndarray, bearings: np.ndarray, ranges: np.ndarray,
@@ -70,46 +70,46 @@ class Grid:
         _expect(self.unknown(), self.obstacles(), self.missed, self.origin, pose[0], pose[1],
                 pose[2] + np.asarray(bearings, float), True)
 
-    def look_gains(self, x: float, y: float, headings: np.ndarray, bearings: np.ndarray
+    def look_gains(self, pose: np.ndarray, headings: np.ndarray, bearings: np.ndarray
                    ) -> np.ndarray:
         """Unknown floor [K] m^2 that looks from a place would show, by the map.
 
         Args:
-            x, y: m.
+            pose: [3] of the place; its own heading does not count.
             headings: [K] rad.
             bearings: [C] rad of the picture's columns.
         """
         unknown, obstacles = self.unknown(), self.obstacles()
-        return np.array([_expect(unknown, obstacles, self.missed, self.origin, x, y,
-                                 heading + bearings, False) for heading in headings])
+        return np.array([_expect(unknown, obstacles, self.missed, self.origin, pose[0],
+                                 pose[1], heading + bearings, False) for heading in headings])
 
     def forget_looks(self) -> None:
         """Let everything be looked at again; obstacles and free floor stay."""
         self.seen *= 0.2
         self.missed[:] = 0
 
-    def stand(self, pose: np.ndarray) -> None:
+    def add_footprint(self, pose: np.ndarray) -> None:
         """Enter that the robot stands here: its footprint is free."""
         self._follow(pose)
         _disc(self.stood, self.origin, pose[0], pose[1], self.footprint, True)
         _disc(self.been, self.origin, pose[0], pose[1], POINT, True)
-        _disc(self.touched, self.origin, pose[0], pose[1], self.footprint - CELL, False)
+        _disc(self.contacts, self.origin, pose[0], pose[1], self.footprint - CELL, False)
 
-    def touch(self, pose: np.ndarray, direction: float) -> None:
+    def add_contact(self, pose: np.ndarray, direction: float) -> None:
         """Enter a contact: something is at the rim of the robot in a direction [rad]."""
         for off in (-0.35, 0.0, 0.35):
             reach = self.footprint + 0.5 * CELL
             x = pose[0] + reach * math.cos(direction + off)
             y = pose[1] + reach * math.sin(direction + off)
-            _disc(self.touched, self.origin, x, y, POINT, True)
+            _disc(self.contacts, self.origin, x, y, POINT, True)
 
     def obstacles(self) -> np.ndarray:
         """[SIDE,SIDE] bool."""
-        return ((self.log_odds > OCCUPIED) & ~self.stood) | self.touched
+        return ((self.log_odds > OCCUPIED) & ~self.stood) | self.contacts
 
     def unknown(self) -> np.ndarray:
         """[SIDE,SIDE] bool: hardly seen."""
-        return (self.seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.touched
+        return (self.seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """Row and column of a place; outside, of the nearest cell."""
@@ -122,7 +122,7 @@ class Grid:
         if MARGIN <= row < SIDE - MARGIN and MARGIN <= column < SIDE - MARGIN:
             return
         shift = np.array([column, row]) - SIDE // 2
-        for name in ('log_odds', 'seen', 'missed', 'stood', 'been', 'touched'):
+        for name in ('log_odds', 'seen', 'missed', 'stood', 'been', 'contacts'):
             old = getattr(self, name)
             new = np.zeros_like(old)
             rows, columns = (np.arange(SIDE) + s for s in shift[::-1])

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
-from vn_nav.policy.search.grid import Grid
+from vn_nav.policy.search.costmap import Costmap
+from vn_nav.policy.search.grid import OccupancyGrid
 from vn_nav.policy.search.hypotheses import Hypotheses, Hypothesis, apart
-from vn_nav.policy.search.ways import Ways
 
 BLOCKED_M, BLOCKED_RAD = 0.2, math.radians(20)  # a contact is remembered about its place
 
@@ -80,7 +80,7 @@ class Searcher:
 
     def reset(self) -> None:
         """Begin a search: an empty map about the robot."""
-        self.grid = Grid(self.footprint)
+        self.grid = OccupancyGrid(self.footprint)
         self.hypotheses = Hypotheses()
         self.pose = np.zeros(3)
         self.aim, self.arrival = 'look', 0.0
@@ -99,7 +99,7 @@ class Searcher:
             unmoved: without odometry: the picture is as before the action.
         """
         self._move(last_action, odometry, unmoved)
-        self.grid.stand(self.pose)
+        self.grid.add_footprint(self.pose)
         self.grid.add_ranges(self.pose, self.bearings, sight.ranges, self.edges)
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
@@ -116,12 +116,12 @@ class Searcher:
         """Follow the robot on the map, and enter what stopped it."""
         before = self.pose
         move = self.moves[action] if action >= 0 else np.zeros(3)
-        known = odometry is not None and self._odometry is not None
-        if known:
-            c, s = math.cos(self._odometry[2]), math.sin(self._odometry[2])
-            dx, dy = np.asarray(odometry[:2]) - self._odometry[:2]
+        if odometry is not None and self._odometry is not None:
+            last = self._odometry
+            c, s = math.cos(last[2]), math.sin(last[2])
+            dx, dy = odometry[:2] - last[:2]
             done = np.array([c * dx + s * dy, c * dy - s * dx,
-                             wrap_angle(float(odometry[2] - self._odometry[2]))])
+                             wrap_angle(float(odometry[2] - last[2]))])
         else:
             done = np.zeros(3) if unmoved and np.hypot(*move[:2]) > 0 else move
         self._odometry = None if odometry is None else np.array(odometry, float)
@@ -133,34 +133,34 @@ class Searcher:
         if wanted > 0:
             if np.hypot(*done[:2]) < 0.75 * wanted:
                 direction = before[2] + math.atan2(move[1], move[0])
-                self.grid.touch(self.pose, direction)
+                self.grid.add_contact(self.pose, direction)
                 self._blocked.append(np.array([*self.pose[:2], direction]))
 
     def _decide(self) -> int:
-        ways = Ways(self.grid)
+        costmap = Costmap(self.grid)
         here = self.grid.cell(*self.pose[:2])
         for own in sorted(self.hypotheses.all, key=lambda own: -own.weight):
             if own.weight < self.rules.follow_from:
                 break
-            action = self._follow(own, ways, here)
+            action = self._follow(own, costmap, here)
             if action is not None:
                 return action
-        action = self._explore(ways, here)
+        action = self._explore(costmap, here)
         if action is not None:
             return action
         # All is seen: take the best guess, then look at everything again.
         best = self.hypotheses.best()
-        if best is not None and (action := self._follow(best, ways, here)) is not None:
+        if best is not None and (action := self._follow(best, costmap, here)) is not None:
             return action
         self.grid.forget_looks()
         self.aim = 'lost'
-        tight = Ways(self.grid, off=0.08)
+        tight = Costmap(self.grid, off=0.08)
         action = self._explore(tight, here)
         if action is not None:
             return action
         return self._away(tight)
 
-    def _follow(self, own: Hypothesis, ways: Ways, here: tuple[int, int]) -> int | None:
+    def _follow(self, own: Hypothesis, costmap: Costmap, here: tuple[int, int]) -> int | None:
         """Towards a hypothesis; None: there is no way, or the robot has been there."""
         gap, _ = apart(self.pose, own.pose)
         if gap <= self.rules.reached_m:
@@ -173,36 +173,35 @@ class Searcher:
         row, column = self.grid.cell(*own.pose[:2])
         reach = 5
         rows, columns = np.mgrid[row - reach:row + reach + 1, column - reach:column + reach + 1]
-        inside = (rows >= 0) & (columns >= 0) & (rows < len(ways.passable)) & (
-            columns < len(ways.passable))
+        inside = (rows >= 0) & (columns >= 0) & (rows < len(costmap.passable)) & (
+            columns < len(costmap.passable))
         cells = np.stack([rows[inside], columns[inside]], axis=1)
         far = np.hypot(*(cells - (row, column)).T)
-        good = ways.passable[cells[:, 0], cells[:, 1]] & (far <= reach)
+        good = costmap.passable[cells[:, 0], cells[:, 1]] & (far <= reach)
         if not good.any():
             return None
-        field = ways.to(cells[good], 0.1 * 1.5 * far[good], here, through_unknown=True)
+        field = costmap.cost_to_go(cells[good], 0.1 * 1.5 * far[good], here, through_unknown=True)
         self.aim = 'follow'
-        return self._drive(field, ways, here)
+        return self._drive(field, costmap, here)
 
-    def _explore(self, ways: Ways, here: tuple[int, int]) -> int | None:
+    def _explore(self, costmap: Costmap, here: tuple[int, int]) -> int | None:
         """Towards unknown floor, or a turn that shows some."""
         rules = self.rules
         turns = np.arange(-math.ceil(math.pi / self._turn), math.ceil(math.pi / self._turn) + 1)
-        gains = self.grid.look_gains(*self.pose[:2], self.pose[2] + turns * self._turn,
-                                     self.bearings)
+        gains = self.grid.look_gains(self.pose, self.pose[2] + turns * self._turn, self.bearings)
         worth = np.minimum(rules.look_worth * gains, rules.look_most)
         price = rules.look_cost * np.abs(turns) - np.where(gains >= rules.look_from, worth, -99.0)
         price[turns == 0] = np.inf
         price += np.where(self._turns_back(turns), rules.back_cost, 0)
         best = int(np.argmin(price))
-        cells, head_start = ways.frontiers()
+        cells, head_start = costmap.frontiers()
         drive = None
         if len(cells):
             most = head_start.max()
-            field = ways.to(cells, most - head_start, here, through_unknown=False)
+            field = costmap.cost_to_go(cells, most - head_start, here, through_unknown=False)
             away = field[here] - most
             if np.isfinite(away) and (price[best] > 50 or away < price[best]):
-                drive = self._drive(field, ways, here)
+                drive = self._drive(field, costmap, here)
         if drive is not None:
             self.aim = 'explore'
             return drive
@@ -211,7 +210,7 @@ class Searcher:
             return self._left if turns[best] > 0 else self._right
         return None
 
-    def _drive(self, field: np.ndarray, ways: Ways, here: tuple[int, int]) -> int | None:
+    def _drive(self, field: np.ndarray, costmap: Costmap, here: tuple[int, int]) -> int | None:
         """The first action of turns and a move that lead on best; None: none does."""
         rules = self.rules
         most = math.ceil(math.pi / self._turn)
@@ -223,7 +222,7 @@ class Searcher:
                 length, angle = math.hypot(dx, dy), yaw + math.atan2(dy, dx)
                 if self._is_blocked(angle):
                     continue
-                got, clear = ways.cut(*self.pose[:2], angle, length)
+                got, clear = costmap.free_length(self.pose, angle, length)
                 end = self.pose[:2] + got * np.array([math.cos(angle), math.sin(angle)])
                 cost = (self._at(field, end) + got + rules.turn_cost * abs(k)
                         + rules.contact_cost * (length - got)
@@ -254,14 +253,14 @@ class Searcher:
             return turns < 0
         return turns > 0 if self._last == self._right else np.zeros(len(turns), bool)
 
-    def _away(self, ways: Ways) -> int:
+    def _away(self, costmap: Costmap) -> int:
         """Any move that seems possible; else a turn."""
         for action in self._drives:
             dx, dy, _ = self.moves[action]
             length = math.hypot(dx, dy)
             angle = self.pose[2] + math.atan2(dy, dx)
             free = not self._is_blocked(angle) and (
-                ways.cut(*self.pose[:2], angle, length)[0] >= 0.9 * length)
+                costmap.free_length(self.pose, angle, length)[0] >= 0.9 * length)
             if free and (dx > 0 or self._last not in (self._left, self._right)):
                 return int(action)
         return self._right if self._last == self._right else self._left

@@ -1,4 +1,4 @@
-"""Where a robot can go on its map, and what that costs; where there is more to see."""
+"""Costmap of an occupancy grid: cost to go, frontiers (Yamauchi, 1997), free straight ways."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numba
 import numpy as np
 
-from vn_nav.policy.search.grid import CELL, Grid
+from vn_nav.policy.search.grid import CELL, OccupancyGrid
 
 KEEP = 0.04  # m beyond the footprint that is passable: a cell's edge is half a cell off
 KEEP_OFF = 0.2  # m beyond the footprint within which a way costs more
@@ -22,8 +22,8 @@ OWN = 0.12  # m about the robot's centre in which it may be whatever the map say
 STEP_COST = np.array([math.sqrt(2), 1.0, math.sqrt(2), 1.0, 1.0, math.sqrt(2), 1.0, math.sqrt(2)])
 
 
-class Ways:
-    """What a map says at one time.
+class Costmap:
+    """Where a robot can be on an occupancy grid as it is now, and what a metre costs there.
 
     Args:
         grid: the map.
@@ -33,10 +33,10 @@ class Ways:
         clearance: [SIDE,SIDE] m to the nearest obstacle.
         passable: [SIDE,SIDE] bool: the robot's centre may be here.
         unknown: [SIDE,SIDE] bool.
-        price: [SIDE,SIDE] float32 cost of a metre; 0 where it is not passable.
+        cost: [SIDE,SIDE] float32 of a metre; 0 where it is not passable.
     """
 
-    def __init__(self, grid: Grid, off: float = 0.0):
+    def __init__(self, grid: OccupancyGrid, off: float = 0.0):
         self.grid = grid
         obstacles = grid.obstacles()
         self.clearance = CELL * cv2.distanceTransform(
@@ -46,7 +46,7 @@ class Ways:
         self.passable = (self.clearance > limit) | grid.been
         close = np.clip((limit + KEEP_OFF - self.clearance) / KEEP_OFF, 0, 1)
         price = 1 + CLOSE_COST * close + UNKNOWN_COST * self.unknown
-        self.price = np.where(self.passable, price, 0).astype(np.float32)
+        self.cost = np.where(self.passable, price, 0).astype(np.float32)
 
     def frontiers(self) -> tuple[np.ndarray, np.ndarray]:
         """Cells [K,2] from which more floor shows, and their head start [K] in metres."""
@@ -58,8 +58,8 @@ class Ways:
         cells = np.argwhere(edge)
         return cells, HEAD_START * share[edge]
 
-    def to(self, cells: np.ndarray, costs: np.ndarray, here: tuple[int, int], *,
-           through_unknown: bool) -> np.ndarray:
+    def cost_to_go(self, cells: np.ndarray, costs: np.ndarray, here: tuple[int, int], *,
+                   through_unknown: bool) -> np.ndarray:
         """Cost of the way to the best of some cells, from everywhere about the robot.
 
         Args:
@@ -70,12 +70,17 @@ class Ways:
         Returns:
             [SIDE,SIDE] float32 m, inf where there is no way or nobody asked.
         """
-        price = self.price if through_unknown else np.where(self.unknown, 0, self.price)
+        price = self.cost if through_unknown else np.where(self.unknown, 0, self.cost)
         return _dijkstra(price, cells.astype(np.int64), costs.astype(np.float64), here[0], here[1])
 
-    def cut(self, x: float, y: float, angle: float, length: float) -> tuple[float, float]:
-        """How far [m] the robot gets on a straight line of some length, and its clearance [m]."""
-        return _cut(self.passable, self.clearance, self.grid.origin, x, y, angle, length)
+    def free_length(self, pose: np.ndarray, angle: float, length: float) -> tuple[float, float]:
+        """How far [m] the robot gets on a straight line of some length, and its clearance [m].
+
+        Args:
+            pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
+        """
+        return _free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
+                            float(pose[1]), angle, length)
 
 
 @numba.njit(cache=True)
@@ -120,7 +125,7 @@ def _dijkstra(price, cells, costs, row0, column0):
 
 
 @numba.njit(cache=True)
-def _cut(passable, clearance, origin, x, y, angle, length):
+def _free_length(passable, clearance, origin, x, y, angle, length):
     side = passable.shape[0]
     dx, dy = math.cos(angle), math.sin(angle)
     count = max(int(math.ceil(length / (0.5 * CELL))), 1)
