@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import datetime
 import json
 import shutil
@@ -29,7 +30,7 @@ from vn_nav.evaluation.evaluator import (
 from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.nodes.isolation import stay_on_this_host
 from vn_nav.nodes.processes import Processes, ProcessFailure
-from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
+from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.report.demo_page import kind_of, write_report
 from vn_nav.report.tables import TITLES, number
 from vn_nav.report.terminal import print_table
@@ -41,6 +42,7 @@ from vn_sim_bridge.simulators import simulator_class
 if TYPE_CHECKING:
     from vn_nav.nodes.demo_watch import EndedEpisode
 
+ONE_HOUSE, ANY_HOUSE = 'models/house', 'models/anywhere'  # the shipped policies
 LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode; the second for a policy of one house
 UNSEEN_HOUSE = 8  # seed, of a house with as many rooms as the trained one
 SEED = 2026  # of starts, goals and light
@@ -51,6 +53,18 @@ RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground
             'episode_result', 'scene', '/diagnostics']
 
 
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """Where the demo drives, and who."""
+
+    place: str  # 'trained' or 'unseen'
+    scene: str
+    count: int  # episodes
+    limit: int  # decisions an episode
+    folder: Path  # of the checkpoint
+    checkpoint: LoadedCheckpoint
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `vn_nav demo`."""
     parser.add_argument('--out', type=Path, default=Path('demo'), help='folder for bag and page')
@@ -59,30 +73,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--episodes', type=int, default=20,
                         help='in the trained scene, or in that of --scene')
     parser.add_argument('--unseen-episodes', type=int, default=10, help='in an unseen house')
-    parser.add_argument('--checkpoint', type=Path, help='instead of the shipped policy of one '
-                        'house, and with --scene of the one of any house')
+    parser.add_argument('--checkpoint', type=Path, help='instead of the shipped policies: of '
+                        'one house in that house, of any house elsewhere')
 
 
 def run(args: argparse.Namespace) -> int:
     """`vn_nav demo`."""
-    folder = args.checkpoint or share_file('models/anywhere' if args.scene else 'models/house')
-    task = load_for_scenes(folder)[0].info['task']  # refuse before anything is written
-    if task != 'image':
-        raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
-                        task, 'use vn_nav evaluate')
-    return demonstrate(args.out, folder, episodes=args.episodes,
+    return demonstrate(args.out, args.checkpoint, episodes=args.episodes,
                        unseen_episodes=args.unseen_episodes, scene=args.scene)
 
 
-def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes: int = 10,
-                scene: str | None = None) -> int:
+def demonstrate(out: Path, folder: Path | None = None, *, episodes: int = 20,
+                unseen_episodes: int = 10, scene: str | None = None) -> int:
     """Drive, record, measure, report.
 
     A checkpoint with a stop threshold has to declare its stop; for others arriving is enough.
 
     Args:
         out: folder for bag, page and result.json; what an earlier demo left there is replaced.
-        folder: of the checkpoint.
+        folder: of the checkpoint; None: the shipped ones.
         episodes, unseen_episodes: in the trained scene and in the unseen house.
         scene: to drive in alone; None: these two.
 
@@ -93,9 +102,7 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
         raise UserError('the demo has at least one episode in each scene',
                         (episodes, unseen_episodes), 'raise --episodes, --unseen-episodes')
     console = Console()
-    loaded = load_checkpoint(folder)
-    info = loaded.info
-    places = _places(info, scene, episodes, unseen_episodes)
+    stages = _stages(folder, scene, episodes, unseen_episodes)
     _import_ros()
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -110,9 +117,8 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
     try:
         processes.start('recorder', 'vn_nav.nodes.recorder_node',
                         {'output': str(out / 'bag'), 'topics': RECORDED})
-        for index, (place, scene, count, limit) in enumerate(places):
-            _drive(console, processes, folder, loaded, place, scene, count, limit,
-                   start_time=1.0 + 1e5 * index)
+        for index, stage in enumerate(stages):
+            _drive(console, processes, stage, start_time=1.0 + 1e5 * index)
     except ProcessFailure as error:
         console.print(f'[red]vn_nav demo: {error}[/]; logs are in {out / "logs"}')
         return 1
@@ -123,9 +129,9 @@ def demonstrate(out: Path, folder: Path, *, episodes: int = 20, unseen_episodes:
                       f'of SIGINT and had to be killed[/]; logs are in {out / "logs"}')
         return 1
     drives = drives_from_bag(out / 'bag', pictures=True)
-    result = _results(drives, places, loaded)
+    result = _results(drives, stages)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
-               'checkpoint': folder.name, 'date': datetime.date.today().isoformat()}
+               'date': datetime.date.today().isoformat()}
     write_report(out / 'report.html', drives, result)
     result['seconds'] = round(time.monotonic() - begun, 1)
     (out / 'result.json').write_text(json.dumps(result, indent=2) + '\n')
@@ -143,29 +149,52 @@ def _import_ros() -> None:
                         "pip install 'vn_nav[ros]', or source an installed Jazzy") from error
 
 
-def _places(info: dict, scene: str | None, episodes: int, unseen_episodes: int
-            ) -> list[tuple[str, str, int, int]]:
-    """Where the demo drives: trained or unseen, the scene, episodes and their limit.
+def _stages(folder: Path | None, scene: str | None, episodes: int, unseen_episodes: int
+            ) -> list[Stage]:
+    """Where the demo drives, and who.
 
     Raises:
-        UserError: no such scene, of another version than the policy's, or nobody names one.
+        UserError: no such scene, of another version than the policy's, nobody names one, or a
+            policy whose task has no goal picture.
     """
     if scene is not None:
         scene = scene_name(scene)
-        simulator = parse_scene(scene).simulator
-        check_version(info, simulator=simulator)
-        known = scene in info['scenes']
-        return [('trained' if known else 'unseen', scene, episodes,
-                 LIMIT if known or len(info['scenes']) > 1 else UNSEEN_LIMIT)]
-    if not info['scenes']:
+        folder = folder or share_file(ANY_HOUSE)
+        checkpoint = _load(folder, scene)
+        known = scene in checkpoint.info['scenes']
+        return [Stage('trained' if known else 'unseen', scene, episodes,
+                      LIMIT if known else _limit(checkpoint), folder, checkpoint)]
+    shipped, folder = folder is None, folder or share_file(ONE_HOUSE)
+    checkpoint = _load(folder)
+    if not checkpoint.info['scenes']:
         raise UserError('the demo drives in the scene of the training', 'a checkpoint that names '
                         'none', 'give --scene')
-    trained = info['scenes'][0]
-    places = [('trained', trained, episodes, LIMIT)]
+    trained = checkpoint.info['scenes'][0]
+    stages = [Stage('trained', trained, episodes, LIMIT, folder, checkpoint)]
     if parse_scene(trained).simulator == HOUSE:  # of which there are always others
-        places.append(('unseen', house_scene(UNSEEN_HOUSE, rooms_of(trained)), unseen_episodes,
-                       UNSEEN_LIMIT))
-    return places
+        unseen = house_scene(UNSEEN_HOUSE, rooms_of(trained))
+        if shipped:
+            folder = share_file(ANY_HOUSE)
+            checkpoint = _load(folder, unseen)
+        stages.append(Stage('unseen', unseen, unseen_episodes, _limit(checkpoint), folder,
+                            checkpoint))
+    return stages
+
+
+def _load(folder: Path, scene: str | None = None) -> LoadedCheckpoint:
+    """A checkpoint that can drive in a scene; None: in its own."""
+    checkpoint = load_for_scenes(folder)[0]
+    if checkpoint.info['task'] != 'image':
+        raise UserError('the demo drives to the places of pictures: a checkpoint of task image',
+                        checkpoint.info['task'], 'use vn_nav evaluate')
+    if scene is not None:
+        check_version(checkpoint.info, simulator=parse_scene(scene).simulator)
+    return checkpoint
+
+
+def _limit(checkpoint: LoadedCheckpoint) -> int:
+    """Decisions that an episode in an unseen scene has at most."""
+    return LIMIT if len(checkpoint.info['scenes']) > 1 else UNSEEN_LIMIT
 
 
 def bridge_parameters(checkpoint: LoadedCheckpoint, scene: str, count: int, limit: int) -> dict:
@@ -196,19 +225,22 @@ def control_env(make_env: Callable, checkpoint: LoadedCheckpoint, scene: str, co
                     actions=checkpoint.config.actions, odometry=odometry)
 
 
-def _drive(console: Console, processes: Processes, folder: Path, checkpoint: LoadedCheckpoint,
-           place: str, scene: str, count: int, limit: int, start_time: float) -> None:
+def _drive(console: Console, processes: Processes, stage: Stage, start_time: float) -> None:
     """All episodes in one scene."""
     from vn_nav.nodes.demo_watch import DemoWatch
-    bridge, policy = f'bridge_{place}', f'policy_{place}'
-    note = '' if place == 'trained' else f' (never seen; episodes end at {limit} decisions)'
-    console.print(f'\n[bold]{place} {kind_of(scene)}[/], {scene}{note}')
+    count = stage.count
+    bridge, policy = f'bridge_{stage.place}', f'policy_{stage.place}'
+    note = ('' if stage.place == 'trained'
+            else f' (never seen; episodes end at {stage.limit} decisions)')
+    console.print(f'\n[bold]{stage.place} {kind_of(stage.scene)}[/], {stage.scene}{note}; '
+                  f'policy {stage.folder.name}')
     with DemoWatch(processes, policy, bridge) as watch:
         processes.start(policy, 'vn_nav.nodes.policy_node', {
-            'checkpoint': str(folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
+            'checkpoint': str(stage.folder), 'robot': str(share_file(BASE)), 'time': 'lock_step',
             'seed': SEED}, (f'__node:={policy}',))
         processes.start(bridge, 'vn_sim_bridge.bridge_node',
-                        bridge_parameters(checkpoint, scene, count, limit) | {
+                        bridge_parameters(stage.checkpoint, stage.scene, count,
+                                          stage.limit) | {
                             'time': 'lock_step', 'start_time': start_time,
                             'exit_when_done': True}, (f'__node:={bridge}',))
         with Live(_progress([], count), console=console, refresh_per_second=8) as live:
@@ -249,23 +281,24 @@ def _progress(done: list[EndedEpisode], count: int) -> Table:
     return table
 
 
-def _results(drives: list[Drive], places, checkpoint: LoadedCheckpoint) -> dict:
+def _results(drives: list[Drive], stages: list[Stage]) -> dict:
     """Figures from the bag; on the same starts random actions, and the policy without ROS."""
-    info, result = checkpoint.info, {}
-    stop = _stop(info)
-    for (place, scene, count, limit), drive in zip(places, drives, strict=True):
+    result = {}
+    for stage, drive in zip(stages, drives, strict=True):
+        info, count = stage.checkpoint.info, stage.count
+        stop = _stop(info)
         figures = summarise([recorded.episode for recorded in drive.episodes])
-        env = control_env(make_env, checkpoint, scene, count, limit)
+        env = control_env(make_env, stage.checkpoint, stage.scene, count, stage.limit)
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())
-        actor = PolicyActor(env, checkpoint.network, info['decoding'], SEED,
+        actor = PolicyActor(env, stage.checkpoint.network, info['decoding'], SEED,
                             STOP_THRESHOLD if stop == ARRIVAL else info['stop_threshold'])
         in_process = run_episodes(env, actor, count, seed=SEED, robot=RobotSpec())
         env.close()
-        result[place] = figures | {'scene': scene, 'max_decisions': limit, 'stop': stop,
-                                   'odometry': env.config.odometry,
-                                   'random': summarise(control),
-                                   'without_ros': summarise(in_process),
-                                   'minus_without_ros': _paired(drive.episodes, in_process)}
+        result[stage.place] = figures | {
+            'scene': stage.scene, 'checkpoint': stage.folder.name, 'max_decisions': stage.limit,
+            'stop': stop, 'odometry': env.config.odometry, 'random': summarise(control),
+            'without_ros': summarise(in_process),
+            'minus_without_ros': _paired(drive.episodes, in_process)}
     return result
 
 

@@ -41,9 +41,9 @@ def write_report(path: Path, drives: list[Drive], result: dict) -> None:
 <h1>Show a robot a picture, and it drives there</h1>
 <p class="soft">Every figure on this page was counted from the ROS 2 bag of one run: simulator and
 policy were two processes that met on ROS topics alone. The policy saw the camera, the goal picture
-and its own last action; no map, no pose, no depth.</p>
+and its own last action; no true pose, no depth, no map of the house.</p>
 {body}
-<h2>Definitions</h2><dl>{_declared_stop(result[places[0][0]])}
+<h2>Definitions</h2><dl>{_declared_stop([result[place] for place, _ in places])}
 <dt>Success</dt><dd>At the end of a decision the robot stands within {ARRIVAL_RADIUS:g} m of the
 place (driving distance) and faces within {math.degrees(ARRIVAL_HEADING):g} degrees of the
 picture's direction. In brackets the 95 % interval.</dd>
@@ -53,16 +53,17 @@ shortest way.</dd>
 walls: a touch ends the movement.</dd>
 <dt>Random</dt><dd>Uniform random actions from the same starts to the same goals. Without this
 line a success rate says little.</dd></dl>
-<p class="soft">vn_nav {__version__}, checkpoint {html.escape(str(result['checkpoint']))},
+<p class="soft">vn_nav {__version__},
 {result['date']}, {result['seconds']:.0f} s.</p>"""))
 
 
-def _declared_stop(figures: dict) -> str:
-    if 'false_stops' not in figures:
+def _declared_stop(figures: list[dict]) -> str:
+    if not any('false_stops' in own for own in figures):
         return ''
     return """
-<dt>Declared stop</dt><dd>Being there is not enough: the policy itself has to declare that it has
-arrived, which ends the episode. Declared elsewhere it is a false stop.</dd>"""
+<dt>Declared stop</dt><dd>Where the figures name it, being there is not enough: the policy itself
+has to declare that it has arrived, which ends the episode. Declared elsewhere it is a false
+stop.</dd>"""
 
 
 def _place(place: str, drive: Drive, figures: dict) -> str:
@@ -93,7 +94,8 @@ def _place(place: str, drive: Drive, figures: dict) -> str:
             if scene.get('rooms_list') else '')
     name = html.escape(scene.get('scene') or f'House {scene["house"]}')
     return f"""<h2>{TITLES[place].format(kind=kind_of(figures['scene']))}</h2>
-<p class="soft">{name}: {size}{figures['episodes']} episodes, mean start distance
+<p class="soft">{name}: {size}policy {html.escape(figures['checkpoint'])},
+{figures['episodes']} episodes, mean start distance
 {number(figures['start_distance'], '.1f')} m.{stop}{limit}</p>
 {boxes}
 <figure>{_map(drive)}<figcaption>Dots are starts, arrows are goals with their viewing direction;
