@@ -90,52 +90,29 @@ def test_a_robot_drives_in_it_and_is_refused_where_it_cannot():
 @pytest.mark.ros
 @pytest.mark.slow
 def test_the_bridge_drives_it_over_ros(tmp_path, monkeypatch):
-    from ros_harness import child, wait_until
-    rclpy = pytest.importorskip('rclpy')
+    pytest.importorskip('rclpy')
+    from bridged import bridged
     from geometry_msgs.msg import Twist
-    from nav_msgs.msg import Odometry
-    from rclpy.executors import SingleThreadedExecutor
-    from sensor_msgs.msg import Image
-    from std_msgs.msg import String
-
-    from vn_nav.nodes.qos import qos
+    from ros_harness import wait_until
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
         [str(ROOT), os.environ.get('PYTHONPATH', '')]))
-    rclpy.init()
-    node, heard = rclpy.create_node('corridor_test'), {}
-    try:
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        for name, kind in (('scene', String), ('image_raw', Image), ('goal_image', Image),
-                           ('ground_truth/odom', Odometry)):
-            heard[name] = []
-            node.create_subscription(kind, name, heard[name].append, qos(name, depth=10))
-        command = node.create_publisher(Twist, 'cmd_vel', qos('cmd_vel'))
+    with bridged(SCENE, tmp_path / 'log', size=24, noise=False) as bridge:
+        facts, heard = bridge.facts, bridge.heard
+        assert facts['scene'] == SCENE and facts['simulator'] == 'examples.corridor'
+        assert facts['world_version'] == '1' and len(facts['goals']) == 4
+        assert heard['image_raw'][-1].width == heard['goal_image'][-1].width == 24
+        topics = {name for name, _ in bridge.node.get_topic_names_and_types()}
+        assert '/labels/names' in topics and '/scan' not in topics  # it knows no walls
+        turn = Twist()
+        turn.angular.z = 0.5
+        first = heard['ground_truth/odom'][0].pose.pose.orientation
 
-        def spin():
-            executor.spin_once(timeout_sec=0.02)
-        with child('vn_sim_bridge.bridge_node', tmp_path / 'log', scene=SCENE, size=24,
-                   noise=False):
-            wait_until(lambda: all(heard.values()), spin)
-            scene = json.loads(heard['scene'][0].data)
-            assert scene['scene'] == SCENE and scene['simulator'] == 'examples.corridor'
-            assert scene['world_version'] == '1' and len(scene['goals']) == 4
-            assert heard['image_raw'][-1].width == heard['goal_image'][-1].width == 24
-            topics = {name for name, _ in node.get_topic_names_and_types()}
-            assert '/labels/names' in topics and '/scan' not in topics  # it knows no walls
-            turn = Twist()
-            turn.angular.z = 0.5
-            first = heard['ground_truth/odom'][0].pose.pose.orientation
-
-            def turned():
-                command.publish(turn)
-                spin()
-                now = heard['ground_truth/odom'][-1].pose.pose.orientation
-                return abs(now.z - first.z) + abs(now.w - first.w) > 0.1
-            wait_until(turned, lambda: None)
-    finally:
-        node.destroy_node()
-        rclpy.shutdown()
+        def turned():
+            bridge.command.publish(turn)
+            bridge.spin()
+            now = heard['ground_truth/odom'][-1].pose.pose.orientation
+            return abs(now.z - first.z) + abs(now.w - first.w) > 0.1
+        wait_until(turned, lambda: None)
 
 
 class Paying(BASE):

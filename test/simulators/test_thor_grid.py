@@ -384,57 +384,34 @@ def test_a_robot_drives_over_the_grid_by_velocities(dump):
 @pytest.mark.slow
 def test_the_bridge_drives_over_the_grid(dump, tmp_path):
     """By Twist, at the speed of the robot: a cell ahead, and then a contact at the wall."""
-    from ros_harness import child, wait_until
-    rclpy = pytest.importorskip('rclpy')
+    pytest.importorskip('rclpy')
+    from bridged import bridged
     from geometry_msgs.msg import Twist
-    from nav_msgs.msg import Odometry
-    from rclpy.executors import SingleThreadedExecutor
-    from sensor_msgs.msg import Image
-    from std_msgs.msg import String
+    from ros_harness import wait_until
+    with bridged(scene(dump[0]), tmp_path / 'log', size=24) as bridge:
+        assert bridge.facts['simulator'] == 'grid' and len(bridge.facts['goals']) == 3
+        poses = grid(dump[0]).poses
+        odom = bridge.heard['ground_truth/odom']
+        odom_queue = len(odom)
+        wait_until(lambda: bridge.command.get_subscription_count() > 0, bridge.spin)
 
-    from vn_nav.nodes.qos import qos
-    rclpy.init()
-    node, heard = rclpy.create_node('grid_test'), {}
-    try:
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        for name, kind in (('scene', String), ('image_raw', Image), ('goal_image', Image),
-                           ('ground_truth/odom', Odometry)):
-            heard[name] = []
-            node.create_subscription(kind, name, heard[name].append, qos(name, depth=10))
-        command = node.create_publisher(Twist, 'cmd_vel', qos('cmd_vel'))
+        def at(message):
+            return message.pose.pose.position.x, message.pose.pose.position.y
+        for speed in (0.2, -0.2):  # to the end of the row, and back to the other
+            twist = Twist()
+            twist.linear.x = speed
+            begun = len(odom)
 
-        def spin():
-            executor.spin_once(timeout_sec=0.02)
-        with child('vn_sim_bridge.bridge_node', tmp_path / 'log', scene=scene(dump[0]), size=24):
-            wait_until(lambda: all(heard.values()), spin)
-            facts = json.loads(heard['scene'][0].data)
-            assert facts['simulator'] == 'grid' and len(facts['goals']) == 3
-            poses = grid(dump[0]).poses
-            odom = heard['ground_truth/odom']
-            odom_queue = len(odom)
-            wait_until(lambda: command.get_subscription_count() > 0, spin)
-
-            def at(message):
-                return message.pose.pose.position.x, message.pose.pose.position.y
-            for speed in (0.2, -0.2):  # to the end of the row, and back to the other
-                twist = Twist()
-                twist.linear.x = speed
-                begun = len(odom)
-
-                def stands(twist=twist, begun=begun):
-                    command.publish(twist)
-                    spin()
-                    return len(odom) > begun + 60 and at(odom[-1]) == at(odom[-20])
-                wait_until(stands, lambda: None)
-            places = np.array([at(message) for message in odom[odom_queue:]])
-            gap = np.hypot(*(poses[:, None, :2] - places[None]).transpose(2, 0, 1))
-            assert np.ptp(places, axis=0).max() >= 0.5 - 1e-6  # from cell to cell
-            assert np.ptp(places, axis=0).min() < 1e-6  # along one axis
-            assert gap.min(axis=0).max() <= 0.25 + 1e-6 and gap[:, -1].min() < 1e-6
-    finally:
-        node.destroy_node()
-        rclpy.shutdown()
+            def stands(twist=twist, begun=begun):
+                bridge.command.publish(twist)
+                bridge.spin()
+                return len(odom) > begun + 60 and at(odom[-1]) == at(odom[-20])
+            wait_until(stands, lambda: None)
+        places = np.array([at(message) for message in odom[odom_queue:]])
+        gap = np.hypot(*(poses[:, None, :2] - places[None]).transpose(2, 0, 1))
+        assert np.ptp(places, axis=0).max() >= 0.5 - 1e-6  # from cell to cell
+        assert np.ptp(places, axis=0).min() < 1e-6  # along one axis
+        assert gap.min(axis=0).max() <= 0.25 + 1e-6 and gap[:, -1].min() < 1e-6
 
 
 @pytest.mark.slow
