@@ -39,6 +39,14 @@ MOVES, OBJECTS = ('bisect', 'arm'), ('still', 'random')  # the first is the defa
 T = TypeVar('T')
 
 
+def _client() -> str:
+    """Version of the installed client, without importing it."""
+    try:
+        return importlib.metadata.version('ai2thor')
+    except importlib.metadata.PackageNotFoundError:
+        return 'missing'
+
+
 class ThorSimulator(BaseSimulator):
     """N robots in scenes of AI2-THOR (see `Simulator`).
 
@@ -51,6 +59,7 @@ class ThorSimulator(BaseSimulator):
 
     capabilities = Capabilities(continuous=True, depth=True, labels=True, geodesic=True,
                                 tilt=True, own_objects=True)
+    version = f'ai2thor-{_client()}-{OURS}'
     label_names = LABEL_NAMES
     exact_turns = True  # thesis, 5.6: noise along the motion alone
     # Which objects those are, each room says itself: `ThorPlace.object_goals`.
@@ -71,7 +80,6 @@ class ThorSimulator(BaseSimulator):
 
     def __init__(self, names: Sequence[str], scenes: Sequence[Scene], setup: Setup, *,
                  arm: bool = False, shuffle: bool = False):
-        self.version = f'ai2thor-{importlib.metadata.version("ai2thor")}-{OURS}'
         self.shuffle = shuffle or bool(setup.models)  # a task that looks for objects
         robot, count = setup.robot, setup.num_envs
         self._lost = np.zeros(count, bool)  # since `broken_off` was last asked
