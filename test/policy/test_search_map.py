@@ -148,12 +148,43 @@ def test_votes_merge_near_ones_count_more_and_misses_refute():
     assert np.hypot(*(own.best().pose[:2] - (4.0, 0.0))) < 0.15  # the near look has the say
     weight = own.best().weight
     own.look(np.array([3.5, 0.0, 0.0]), np.zeros(2), 1.0, np.array([1.0, 0.0]), 0.05)
-    assert own.best().weight == weight / 2 and own.best().refuted == 1
+    assert own.best().weight == weight / 2
     own.look(np.zeros(3), np.array([-3.0, 0.0]), 0.5, np.array([-1.0, 0.0]), 0.99)
     assert len(own.all) == 2
     for _ in range(12):
         own.look(near_pose + [0.6, 0, 0], np.zeros(2), 1.0, np.array([1.0, 0.0]), 0.05)
     assert len(own.all) == 1 and own.best().pose[0] == pytest.approx(-3.0)
+
+
+def test_each_attempt_in_vain_asks_for_more_evidence():
+    own = Hypotheses()
+    for _ in range(4):
+        own.look(np.zeros(3), np.array([2.0, 0.0]), 0.3, np.array([1.0, 0.0]), 0.95)
+    best = own.best()
+    assert own.worth_trying(2.0) == [best]
+    own.refute(best)
+    best.weight = 7.9
+    assert own.worth_trying(2.0) == []
+    best.weight = 8.1
+    assert own.worth_trying(2.0) == [best]
+
+
+def test_a_way_that_becomes_no_shorter_is_given_up():
+    own = Hypotheses()
+    own.look(np.zeros(3), np.array([2.0, 0.0]), 0.3, np.array([1.0, 0.0]), 0.95)
+    assert not any(own.best().is_stuck(cost) for cost in np.arange(9.0, 1.0, -0.5))
+    assert [own.best().is_stuck(2.0) for _ in range(12)].count(True) == 1
+
+
+def test_a_frontier_that_shows_nothing_is_given_up():
+    own = searcher()
+    last, odometry = -1, np.zeros(3)
+    hole = own.grid.cell(1.6, 0.0)
+    for _ in range(60):  # all of the room is seen, and a wall looks open that is none
+        own.step(sight(ranges=one_hot(room(odometry))), last, odometry)
+        own.grid.log_odds[hole[0] - 5:hole[0] + 6, hole[1]:hole[1] + 6] = -2
+        own.grid.seen[hole[0] - 5:hole[0] + 6, hole[1]:hole[1] + 6] = 1
+    assert (own.grid.missed == 3).any()
 
 
 def test_a_look_is_put_on_the_map_by_the_robots_pose():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from conformance import GROWTH_MB, SIZE, Conformance
 
+from vn_nav import cli
 from vn_nav.errors import EnvironmentLost, UserError
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_nav.scenes import parse_scene
@@ -105,6 +106,16 @@ def test_an_episode_of_the_arena_is_the_engines():
         ended += int(terminated.sum())
     assert ended >= 6 and np.abs(rewards).max() >= 1
     env.close()
+
+
+def test_nothing_leads_the_robot_to_a_goal_where_fruit_is_the_task(tmp_path, capsys):
+    with pytest.raises(UserError, match='pays itself takes no progress_reward'):
+        environment('dmlab:arena', progress_reward=1.0)
+    assert cli.main(['train', '--preset', 'fast', '--scene', 'dmlab:arena', '--envs', '2',
+                     '--frames', '100', '--no-tensorboard', '--out', str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    for name in ('progress_reward', 'goal_pose', 'arrival', 'distance', 'pair_minutes'):
+        assert f'{name} is left out' in told, name
 
 
 @pytest.mark.parametrize('scene', ['dmlab:house', 'dmlab:maze?seed=5'])

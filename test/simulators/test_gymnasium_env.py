@@ -215,6 +215,8 @@ def test_no_stop_is_declared_where_the_simulator_ends_its_episodes():
     with contextlib.closing(env_of(size=36)) as env:
         network = build_policy(NetworkConfig(actions=env.action_names, size=36,
                                              heads=('arrival',)))
+    with pytest.raises(UserError, match='progress_reward needs a simulator that knows ways'):
+        env_of(progress_reward=1.0)
     rows = measure(make, network, [SCENE], decoding='sample', episodes=4, controls=())
     assert list(rows) == ['arrival']
 

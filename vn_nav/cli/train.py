@@ -176,7 +176,7 @@ def run(args: argparse.Namespace) -> int:
                    goal_variants=args.goal_variants,
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
     config, words = config_without(config, env.config.privileged, env.simulator_name,
-                                   always=ALWAYS if env.distance_unit else ())
+                                   always=ALWAYS if _has_goals(env, config.device) else ())
     for line in words:
         print(line, flush=True)
     bags = _bag_mix(args, config, env.robot)
@@ -191,6 +191,12 @@ def run(args: argparse.Namespace) -> int:
         print(train(env, config, args.out, info=info, resume=args.resume, init=args.init,
                     pairs=pairs, bags=bags))
     return 0
+
+
+def _has_goals(env, device: str) -> bool:
+    """Whether arriving somewhere is what an environment is about, as in houses on any device."""
+    return device != 'cpu' or bool(
+        env.distance_unit and not env.simulator.capabilities.rewards)
 
 
 def _info(args: argparse.Namespace, config, env, bags) -> dict:

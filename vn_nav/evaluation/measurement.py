@@ -113,6 +113,9 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
     def make(names: Sequence[str], environments: int, stop: str):
         env = make_env(names, environments, stop)
         can = env.simulator.capabilities
+        if can.rewards:  # its task is its own: no goal to show another of, and no way to it
+            controls[:] = [name for name in controls
+                           if name in (evaluator.OTHER, evaluator.RANDOM)]
         if not (can.geodesic or env.simulator.planner) and evaluator.SHORTEST in controls:
             controls.remove(evaluator.SHORTEST)
         # One goal has no other to take for it; where there is none, none is shown.

@@ -292,10 +292,10 @@ class BatchedPolicy:
                                   torch.from_numpy(np.asarray(obs['goal_index'])))
         last_action, reset_mask = np.asarray(obs['last_action']), np.asarray(reset_mask, bool)
         if self.search is not None:
-            actions = self.search.act(obs['image'], maps, last_action, reset_mask,
-                                      obs.get('odometry'))
+            chosen = self.search.act(obs['image'], maps, last_action, reset_mask,
+                                     obs.get('odometry'))
             self.arrival = self.search.arrival.copy()
-            return actions
+            return chosen
         observation = Observation(
             torch.from_numpy(obs['image'])[None], None, None,
             torch.from_numpy(last_action)[None],

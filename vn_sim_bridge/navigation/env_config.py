@@ -19,7 +19,7 @@ TASKS = ('image', 'object', 'room', 'collect')
 PRIVILEGED = ('depth', 'segmentation', 'goal_segmentation', 'oracle_action', 'goal_pose',
               'overlap', 'explorer_action', 'oracle_regret')
 # What not every simulator can do, and what it lacks then.
-OPTIONAL = {'progress_reward': 'the simulator knows no driving distances',
+OPTIONAL = {'progress_reward': 'the simulator knows no driving distances, or pays itself',
             'exploration_reward': 'the simulator has no floor map',
             'randomisation': 'light and camera do not vary in this simulator'}
 STOPS = ('arrival', 'declared')
@@ -126,7 +126,9 @@ def tells(simulator: Simulator) -> set[str]:
         'oracle_action': can.geodesic or simulator.planner is not None,
         'oracle_regret': simulator.planner is not None, 'explorer_action': can.walls and shared,
         'goal_pose': shared, 'overlap': shared}
-    return {name for name in PRIVILEGED if known[name]}
+    if can.rewards:  # its task is its own: no goal of ours, and no way to one
+        known = {name: known[name] for name in ('depth', 'segmentation')}
+    return {name for name in PRIVILEGED if known.get(name)}
 
 
 def without_the_unknown(config: EnvConfig, simulator: Simulator, optional: Collection[str]
@@ -146,7 +148,7 @@ def without_the_unknown(config: EnvConfig, simulator: Simulator, optional: Colle
     without: dict[str, Any] = {
         'progress_reward': 0.0, 'exploration_reward': 0.0,
         'randomisation': config.randomisation.of_the_base()}
-    asked = {'progress_reward': config.progress_reward and not can.geodesic,
+    asked = {'progress_reward': config.progress_reward and (can.rewards or not can.geodesic),
              'exploration_reward': (config.exploration_reward
                                     and not have_floors(simulator.places)),
              'randomisation': config.randomisation.varies_pictures and not can.appearance}
@@ -193,6 +195,8 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
          'odometry needs robots that move in metres; there it is none', config.odometry),
         (can.geodesic or not config.progress_reward,
          'progress_reward needs a simulator that knows ways', config.progress_reward),
+        (not can.rewards or not config.progress_reward,
+         'a simulator that pays itself takes no progress_reward', config.progress_reward),
         (can.geodesic or simulator.planner or 'oracle_action' not in told,
          'oracle_action needs a simulator that knows ways', 'oracle_action'),
         (can.walls or 'explorer_action' not in told, 'the explorer needs a simulator that knows '

@@ -15,7 +15,7 @@ import numpy as np
 CELL = 0.1  # m
 SIDE = 320  # cells
 MARGIN = 60  # cells from the edge at which the map is moved
-REACH = 5.0  # m: ranges beyond tell nothing about cells
+REACH = 3.5  # m: ranges beyond tell nothing about cells
 SUB_RAYS = 3  # a column of the picture
 FREE_WEIGHT, HIT_WEIGHT = 0.9, 3.0  # log-odds of a ray that passes, and of one that ends here
 MOST = 4.0  # log-odds either way
@@ -88,6 +88,17 @@ class OccupancyGrid:
         self.seen *= 0.2
         self.missed[:] = 0
 
+    def known_area(self) -> float:
+        """Floor that was seen [m^2]."""
+        return CELL**2 * float(np.count_nonzero(self.seen >= KNOWN))
+
+    def give_up(self, cell: tuple[int, int], radius: float) -> None:
+        """Let nothing within a radius [m] of a cell be looked for any more."""
+        x, y = self.origin + CELL * (np.array(cell[::-1]) + 0.5)
+        done = np.zeros((SIDE, SIDE), bool)
+        _disc(done, self.origin, x, y, radius, True)
+        self.missed[done] = MISSES
+
     def add_footprint(self, pose: np.ndarray) -> None:
         """Enter that the robot stands here: its footprint is free."""
         self._follow(pose)
@@ -97,11 +108,9 @@ class OccupancyGrid:
 
     def add_contact(self, pose: np.ndarray, direction: float) -> None:
         """Enter a contact: something is at the rim of the robot in a direction [rad]."""
-        for off in (-0.35, 0.0, 0.35):
-            reach = self.footprint + 0.5 * CELL
-            x = pose[0] + reach * math.cos(direction + off)
-            y = pose[1] + reach * math.sin(direction + off)
-            _disc(self.contacts, self.origin, x, y, POINT, True)
+        reach = self.footprint + 0.5 * CELL
+        _disc(self.contacts, self.origin, pose[0] + reach * math.cos(direction),
+              pose[1] + reach * math.sin(direction), POINT, True)
 
     def obstacles(self) -> np.ndarray:
         """[SIDE,SIDE] bool."""

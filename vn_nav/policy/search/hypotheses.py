@@ -9,13 +9,15 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 
-VOTES_FROM = 0.6  # co-visibility of a look that votes
+VOTES_FROM = 1.5  # odds of a look that votes
 MERGE_M, MERGE_RAD = 1.2, math.radians(50)  # votes so near each other are for one place
 ODDS_MOST = 20.0  # a look's
 NEAR = 0.7  # m: from here on a look is worth no more for being nearer
 MISS_M, MISS_RAD = 1.3, math.radians(35)  # seen from so near, the goal would be recognised
 MISS_BELOW = 0.35  # co-visibility that refutes there
 WEIGHT_MOST = 200.0
+PROGRESS_M, PATIENCE = 0.2, 12  # decisions in which a way has to become shorter by so much
+AGAIN = 4.0  # times as much evidence is asked after each attempt in vain
 FORGET = 0.1  # weight under which a hypothesis is dropped
 
 
@@ -27,13 +29,27 @@ class Hypothesis:
         pose: [3] x, y [m], yaw [rad] on the map.
         weight: evidence: sum of odds over distance.
         precision: of the position [1/m^2], of the votes together.
-        refuted: how often it was seen near and not recognised, or stood at in vain.
+        refuted: how often the robot stood at it, or was on its way there, in vain.
+        nearest: the least cost to go on the way there [m]; waited: decisions since then.
     """
 
     pose: np.ndarray
     weight: float
     precision: float
     refuted: int = 0
+    nearest: float = math.inf
+    waited: int = 0
+
+    def is_stuck(self, cost: float) -> bool:
+        """Whether the robot, on its way here at a cost, has come no nearer for too long."""
+        if cost < self.nearest - PROGRESS_M:
+            self.nearest, self.waited = cost, 0
+        else:
+            self.waited += 1
+        if self.waited < PATIENCE:
+            return False
+        self.nearest, self.waited = math.inf, 0
+        return True
 
 
 def on_map(pose: np.ndarray, position: np.ndarray, heading: np.ndarray) -> np.ndarray:
@@ -63,18 +79,26 @@ class Hypotheses:
             gap, turn = apart(pose, own.pose)
             if gap < MISS_M and turn < MISS_RAD and co_visible < MISS_BELOW:
                 own.weight *= 0.5
-                own.refuted += 1
-        if co_visible > VOTES_FROM:
-            odds = min(co_visible / max(1 - co_visible, 1e-6), ODDS_MOST)
+        odds = min(co_visible / max(1 - co_visible, 1e-6), ODDS_MOST)
+        if odds > VOTES_FROM:
             far = float(np.hypot(*position))
             self._vote(on_map(pose, position, heading), odds / max(far, NEAR),
                        co_visible / max(sigma, 0.15) ** 2)
         self.all = [own for own in self.all if own.weight > FORGET]
 
     def refute(self, own: Hypothesis) -> None:
-        """The robot stood there, and it was not the goal."""
+        """The robot stood there, and it was not the goal; or it did not get there."""
         own.refuted += 1
         own.weight *= 0.25
+
+    def worth_trying(self, least: float) -> list[Hypothesis]:
+        """Those with enough evidence, the best first; after each attempt in vain more is asked.
+
+        Args:
+            least: evidence that is enough for a first attempt.
+        """
+        return sorted((own for own in self.all if own.weight >= least * AGAIN**own.refuted),
+                      key=lambda own: -own.weight / AGAIN**own.refuted)
 
     def best(self) -> Hypothesis | None:
         """The one with most evidence."""

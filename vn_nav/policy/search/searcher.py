@@ -12,10 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
-from vn_nav.policy.search.costmap import Costmap
+from vn_nav.policy.search.costmap import ROOM, Costmap
 from vn_nav.policy.search.grid import OccupancyGrid
 from vn_nav.policy.search.hypotheses import Hypotheses, Hypothesis, apart
 
+# Decisions of exploring that show less new floor than this: where it leads there is none.
+IDLE, IDLE_M2 = 12, 0.5
 BLOCKED_M, BLOCKED_RAD = 0.2, math.radians(20)  # a contact is remembered about its place
 
 
@@ -86,6 +88,7 @@ class Searcher:
         self.aim, self.arrival = 'look', 0.0
         self._last = -1
         self._odometry: np.ndarray | None = None
+        self._known: list[float] = []  # m^2, at the decisions of exploring
         self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
@@ -139,9 +142,7 @@ class Searcher:
     def _decide(self) -> int:
         costmap = Costmap(self.grid)
         here = self.grid.cell(*self.pose[:2])
-        for own in sorted(self.hypotheses.all, key=lambda own: -own.weight):
-            if own.weight < self.rules.follow_from:
-                break
+        for own in self.hypotheses.worth_trying(self.rules.follow_from):
             action = self._follow(own, costmap, here)
             if action is not None:
                 return action
@@ -165,6 +166,9 @@ class Searcher:
         gap, _ = apart(self.pose, own.pose)
         if gap <= self.rules.reached_m:
             turn = wrap_angle(float(own.pose[2] - self.pose[2]))
+            if own.is_stuck(0.0):
+                self.hypotheses.refute(own)
+                return None
             if abs(turn) > self.rules.reached_rad and abs(turn) > 0.55 * self._turn:
                 self.aim = 'turn'
                 return self._left if turn > 0 else self._right
@@ -181,6 +185,9 @@ class Searcher:
         if not good.any():
             return None
         field = costmap.cost_to_go(cells[good], 0.1 * 1.5 * far[good], here, through_unknown=True)
+        if own.is_stuck(float(field[here])):
+            self.hypotheses.refute(own)
+            return None
         self.aim = 'follow'
         return self._drive(field, costmap, here)
 
@@ -201,6 +208,8 @@ class Searcher:
             field = costmap.cost_to_go(cells, most - head_start, here, through_unknown=False)
             away = field[here] - most
             if np.isfinite(away) and (price[best] > 50 or away < price[best]):
+                if self._sees_nothing_new():
+                    self.grid.give_up(_foot_of(field, here), ROOM)
                 drive = self._drive(field, costmap, here)
         if drive is not None:
             self.aim = 'explore'
@@ -209,6 +218,15 @@ class Searcher:
             self.aim = 'look'
             return self._left if turns[best] > 0 else self._right
         return None
+
+    def _sees_nothing_new(self) -> bool:
+        """Whether exploring has shown hardly any floor for too long; asked once a decision."""
+        known = self.grid.known_area()
+        self._known.append(known)
+        if len(self._known) <= IDLE or known - self._known[-1 - IDLE] > IDLE_M2:
+            return False
+        self._known.clear()
+        return True
 
     def _drive(self, field: np.ndarray, costmap: Costmap, here: tuple[int, int]) -> int | None:
         """The first action of turns and a move that lead on best; None: none does."""
@@ -264,3 +282,16 @@ class Searcher:
             if free and (dx > 0 or self._last not in (self._left, self._right)):
                 return int(action)
         return self._right if self._last == self._right else self._left
+
+
+def _foot_of(field: np.ndarray, here: tuple[int, int]) -> tuple[int, int]:
+    """The cell that the way from here ends at, downhill on the cost to go."""
+    row, column = here
+    for _ in range(field.size):
+        low, left = max(row - 1, 0), max(column - 1, 0)
+        part = field[low:row + 2, left:column + 2]
+        i, j = np.unravel_index(int(np.argmin(part)), part.shape)
+        if (low + i, left + j) == (row, column):
+            break
+        row, column = int(low + i), int(left + j)
+    return row, column
