@@ -163,9 +163,9 @@ def test_each_attempt_in_vain_asks_for_more_evidence():
     best = own.best()
     assert own.worth_trying(2.0) == [best]
     own.refute(best)
-    best.weight = 7.9
+    best.weight = 1.45 * 2.0
     assert own.worth_trying(2.0) == []
-    best.weight = 8.1
+    best.weight = 1.55 * 2.0
     assert own.worth_trying(2.0) == [best]
 
 

@@ -17,7 +17,7 @@ MISS_M, MISS_RAD = 1.3, math.radians(35)  # seen from so near, the goal would be
 MISS_BELOW = 0.35  # co-visibility that refutes there
 WEIGHT_MOST = 200.0
 PROGRESS_M, PATIENCE = 0.2, 12  # decisions in which a way has to become shorter by so much
-AGAIN = 4.0  # times as much evidence is asked after each attempt in vain
+AGAIN = 1.5  # times as much evidence is asked after each attempt in vain
 FORGET = 0.1  # weight under which a hypothesis is dropped
 
 
