@@ -19,16 +19,18 @@ CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
 # last angle is that of the robot's place off the line behind the goal. The rest stands anywhere.
 BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
 GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
-# The mixture `RECOGNITION` is for telling the goal from what is nearly it: about a third there or
-# where the goal is likely seen, a third nearly there, a third elsewhere. Shares (the rest of one
-# stands anywhere in the place); distances [m] and headings off the goal's [rad], each drawn
-# between two limits. The ring shows the goal from near, so that most of the first third is far.
+# The mixture `RECOGNITION` is for telling the goal from what is nearly it: about half there or
+# where the goal is likely seen, a fifth nearly there (the hard ring), the rest elsewhere. Shares
+# (what is left of one stands anywhere in the place); distances [m] and headings off the goal's
+# [rad], each drawn between two limits. Thirds taught to recognise near goals alone: of those
+# beyond 3 m a quarter was called in view, at a heading no better than chance; a pair counts both
+# ways round, and from afar the goal is in view one way only.
 USUAL, RECOGNITION = 'usual', 'recognition'  # mixtures
-THERE = (0.12, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
-SEEN = 0.25  # and as `NEARBY` and `BEHIND`, in equal parts
-BESIDE = (0.15, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
-ASKEW = (0.14, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew
-TURNED = (0.17, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
+THERE = (0.10, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
+SEEN, AFAR = 0.38, 0.75  # as `NEARBY` and `BEHIND`: share, and that of `BEHIND` in it
+BESIDE = (0.11, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
+ASKEW = (0.10, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew
+TURNED = (0.16, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
 TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
 
 
@@ -128,10 +130,10 @@ def place_to_recognise(draws, places, cells, first_cell, rects, first_rect, free
     usual = draws.copy()
     for k in range(len(places)):
         kind = draws[k, 1]
-        if kind < SEEN:  # `NEARBY` and `BEHIND` by the usual rules, half and half
+        if kind < SEEN:  # `NEARBY` and `BEHIND` by the usual rules
             within = kind / SEEN
-            usual[k, 1] = (2 * within * NEARBY[0] if within < 0.5 else
-                           NEARBY[0] + CLOSE[0] + (2 * within - 1) * BEHIND[0])
+            usual[k, 1] = (within / (1 - AFAR) * NEARBY[0] if within < 1 - AFAR else
+                           NEARBY[0] + CLOSE[0] + (within - 1 + AFAR) / AFAR * BEHIND[0])
         else:
             usual[k, 1] = 1.0  # anywhere, unless one of the kinds below
     place_usually(usual, places, cells, first_cell, rects, first_rect, free, origins, radius,

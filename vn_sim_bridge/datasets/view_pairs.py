@@ -41,8 +41,8 @@ class PairSampler:
         seed: of the draws.
         threads: threads that draw.
         mix: of `pair_poses.PLACERS`, how robots stand: 'usual' as above, or 'recognition':
-            about a third there or where the goal is likely seen, a third nearly there (`BESIDE`,
-            `ASKEW`), a third in the same room turned away (`TURNED`) or anywhere.
+            about half there or where the goal is likely seen, a fifth nearly there (`BESIDE`,
+            `ASKEW`), the rest in the same room turned away (`TURNED`) or anywhere.
 
     Raises:
         UserError: no scene, an unknown mix, or a simulator that cannot look from anywhere.
