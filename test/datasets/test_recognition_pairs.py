@@ -31,16 +31,16 @@ def test_the_usual_pairs_are_as_they_were():
     assert np.allclose(goal_poses.sum(0), [1500.4, 1437.3, -92.2907, 0], atol=1e-3)
 
 
-def test_thirds_there_nearly_there_and_elsewhere(sampler):
+def test_there_in_sight_nearly_there_and_elsewhere(sampler):
     place, poses, goal_poses = sampler.poses(np.arange(6000))
     distance = np.hypot(*(poses - goal_poses)[:, :2].T)
     turn = np.degrees(np.abs(wrap_angle(poses[:, 2] - goal_poses[:, 2])))
     beside = (distance >= 0.6) & (distance <= 1.5) & (turn <= 45)
     askew = (distance <= 0.6) & (turn >= 30) & (turn <= 60)
     # The other kinds add to the ring what happens to fall there.
-    assert 0.28 < (beside | askew).mean() < 0.42
-    assert 0.13 < askew.mean() < 0.20 and 0.14 < beside.mean() < 0.28
-    assert 0.10 < sampler.arrived(place, poses, goal_poses).mean() < 0.22
+    assert 0.20 < (beside | askew).mean() < 0.35
+    assert 0.09 < askew.mean() < 0.16 and 0.10 < beside.mean() < 0.22
+    assert 0.08 < sampler.arrived(place, poses, goal_poses).mean() < 0.20
     assert 0.2 < (turn > 60).mean() < 0.42 and (distance > 4).mean() > 0.03
     for index, built in enumerate(sampler.places):
         own = poses[place == index]

@@ -36,7 +36,8 @@ from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.report.sight_page import sight_page
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import house_scenes
-from vn_sim_bridge.datasets.view_pairs import RECOGNITION, PairSampler
+from vn_sim_bridge.datasets.pair_poses import RECOGNITION
+from vn_sim_bridge.datasets.view_pairs import PairSampler
 
 ROBOT = RobotSpec().with_actions(('forward', 'rotate_left', 'rotate_right'))
 CONFIG = NetworkConfig(

@@ -45,7 +45,8 @@ def run(args: argparse.Namespace, config: TrainConfig) -> int:
         raise UserError('the preset search learns on the processor', config.device,
                         'use --device cpu')
     from vn_nav.robot import load_robot
-    from vn_sim_bridge.datasets.view_pairs import RECOGNITION, PairSampler
+    from vn_sim_bridge.datasets.pair_poses import RECOGNITION
+    from vn_sim_bridge.datasets.view_pairs import PairSampler
     from vn_sim_bridge.render.randomisation import load_randomisation
     torch.set_num_threads(config.threads)
     scenes, others = _scenes(args, config)

@@ -12,7 +12,7 @@ from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, uniform
-from vn_sim_bridge.datasets.view_pairs import BEHIND, CLOSE, NEARBY
+from vn_sim_bridge.datasets.pair_poses import BEHIND, CLOSE, NEARBY
 from vn_sim_bridge.recorded.image_graph import ImageGraph
 from vn_sim_bridge.simulators.recorded import cameras_at, turned
 

@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 
 import cv2
-import numba
 import numpy as np
 
 from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
+from vn_sim_bridge.datasets.pair_poses import PLACERS, TRIES, USUAL
 from vn_sim_bridge.datasets.view_ranges import ranges_of_depth, ray_cast
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import CELL, FloorMap
@@ -22,25 +22,6 @@ from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.simulator import Frames, Place, Setup
 from vn_sim_bridge.simulators import open_simulator, robot_for
 
-# How robots stand: share of the pairs, largest distance [m] and heading [rad] from the goal's.
-NEARBY = (0.30, 4.0, math.radians(75))
-CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
-# With the goal ahead: pairs that overlap are seldom farther than a metre apart otherwise, and a
-# robot that comes into a room sees its goal from afar. The heading is off that to the goal; the
-# last angle is that of the robot's place off the line behind the goal. The rest stands anywhere.
-BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
-GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
-# The mixture `RECOGNITION` is for telling the goal from what is nearly it: about a third there or
-# where the goal is likely seen, a third nearly there, a third elsewhere. Shares (the rest of one
-# stands anywhere in the place); distances [m] and headings off the goal's [rad], each drawn
-# between two limits. The ring shows the goal from near, so that most of the first third is far.
-MIXES = USUAL, RECOGNITION = 'usual', 'recognition'
-THERE = (0.12, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
-SEEN = 0.25  # and as `NEARBY` and `BEHIND`, in equal parts
-BESIDE = (0.15, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
-ASKEW = (0.14, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew
-TURNED = (0.17, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
-TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
 WINDOW = 12  # cells around a goal that a path of the arrival radius cannot leave
 
 
@@ -48,9 +29,9 @@ class PairSampler:
     """Independent random pairs of views in some scenes.
 
     A goal stands on a random free cell, with free floor straight ahead. A robot stands near it
-    (`NEARBY`, `CLOSE`, `BEHIND`: where it touches nothing) or anywhere in its place. Light and
-    camera of the two are drawn apart. Everything is a function of the seed and the number of the
-    draw: to go on later, keep `count` and set it again.
+    (`pair_poses.NEARBY`, `CLOSE`, `BEHIND`: where it touches nothing) or anywhere in its place.
+    Light and camera of the two are drawn apart. Everything is a function of the seed and the
+    number of the draw: to go on later, keep `count` and set it again.
 
     Args:
         scenes: names, all of one simulator.
@@ -59,9 +40,9 @@ class PairSampler:
         randomisation: of light and camera; default: nothing varies.
         seed: of the draws.
         threads: threads that draw.
-        mix: of `MIXES`, how robots stand about goals: 'usual' as above, or 'recognition': about a
-            third there or where the goal is likely seen, a third nearly there (`BESIDE`,
-            `ASKEW`), a third in the same room turned away (`TURNED`) or anywhere.
+        mix: of `pair_poses.PLACERS`, how robots stand: 'usual' as above, or 'recognition':
+            about half there or where the goal is likely seen, a fifth nearly there (`BESIDE`,
+            `ASKEW`), the rest in the same room turned away (`TURNED`) or anywhere.
 
     Raises:
         UserError: no scene, an unknown mix, or a simulator that cannot look from anywhere.
@@ -72,9 +53,9 @@ class PairSampler:
                  mix: str = USUAL):
         if len(scenes) < 1:
             raise UserError('there is at least one scene', scenes, 'name some')
-        if mix not in MIXES:
-            raise UserError(f'the mix of pairs is one of {", ".join(MIXES)}', mix, 'choose one')
-        self._place = _place if mix == USUAL else _place_to_recognise
+        if mix not in PLACERS:
+            raise UserError(f'the mix of pairs is one of {", ".join(PLACERS)}', mix, 'choose one')
+        self._place = PLACERS[mix]
         self.count = 0  # pairs drawn so far
         self._seed, self._size = seed, size
         self.robot = robot_for(scenes, robot)
@@ -288,137 +269,3 @@ def _stand(pose: np.ndarray, cells: np.ndarray, headings: np.ndarray | None) -> 
         best = near[np.argmin(tasks.heading_error(headings[near], pose[2]))]
         pose[2] = headings[best]
     pose[:2] = cells[best]
-
-
-@numba.njit(cache=True)
-def _fits(x, y, place, rects, first_rect, free, origins, radius):
-    """Whether a robot can stand, and get, there."""
-    column = math.floor((x - origins[place, 0]) / CELL)
-    row = math.floor((y - origins[place, 1]) / CELL)
-    if not (0 <= row < free.shape[1] and 0 <= column < free.shape[2]
-            and free[place, int(row), int(column)]):
-        return False
-    for m in range(first_rect[place], first_rect[place + 1]):
-        dx = max(max(rects[m, 0] - x, x - rects[m, 2]), 0.0)
-        dy = max(max(rects[m, 1] - y, y - rects[m, 3]), 0.0)
-        if dx * dx + dy * dy < radius * radius:
-            return False
-    return True
-
-
-@numba.njit(cache=True)
-def _stand_goal(goal, rest, place, cells, low, count, rects, first_rect, free, origins):
-    """A goal [4] on a random cell, free straight ahead, by uniform numbers [2*TRIES]."""
-    for attempt in range(TRIES):
-        cell = low + int(rest[2 * attempt] * count)
-        goal[0], goal[1] = cells[cell, 0], cells[cell, 1]
-        goal[2] = (2 * rest[2 * attempt + 1] - 1) * math.pi
-        c, s = math.cos(goal[2]), math.sin(goal[2])
-        clear = True
-        for step in range(1, 6):
-            reach = GOAL_CLEARANCE * step / 5
-            if not _fits(goal[0] + c * reach, goal[1] + s * reach, place, rects, first_rect,
-                         free, origins, 0.0):
-                clear = False
-                break
-        if clear:
-            break
-
-
-@numba.njit(cache=True)
-def _stand_anywhere(pose, rest, place, cells, low, count, rects, first_rect, free, origins,
-                    radius):
-    """A robot [4], but for its heading, anywhere in its place, by uniform numbers [3*TRIES]."""
-    # Off the centre of its cell: robots stop anywhere.
-    for attempt in range(TRIES):
-        cell = low + int(rest[3 * attempt] * count)
-        pose[0] = cells[cell, 0] + (rest[3 * attempt + 1] - 0.5) * CELL
-        pose[1] = cells[cell, 1] + (rest[3 * attempt + 2] - 0.5) * CELL
-        if _fits(pose[0], pose[1], place, rects, first_rect, free, origins, radius):
-            break
-
-
-@numba.njit(cache=True)
-def _place(draws, places, cells, first_cell, rects, first_rect, free, origins, radius, poses,
-           goal_poses):
-    """Stand goals and robots up, by uniform numbers [K,3+5*TRIES]."""
-    for k in range(len(places)):
-        place = places[k]
-        low, count = first_cell[place], first_cell[place + 1] - first_cell[place]
-        rest = draws[k, 3:]
-        goal = goal_poses[k]
-        _stand_goal(goal, rest, place, cells, low, count, rects, first_rect, free, origins)
-        rest = rest[2 * TRIES:]
-        pose = poses[k]
-        kind = draws[k, 1]
-        behind = NEARBY[0] + CLOSE[0] <= kind < NEARBY[0] + CLOSE[0] + BEHIND[0]
-        if kind >= NEARBY[0] + CLOSE[0] + BEHIND[0]:
-            _stand_anywhere(pose, rest, place, cells, low, count, rects, first_rect, free, origins,
-                            radius)
-            pose[2] = (2 * draws[k, 2] - 1) * math.pi
-            continue
-        farthest, turn = BEHIND[1], BEHIND[2]
-        if not behind:
-            farthest, turn = (NEARBY[1], NEARBY[2]) if kind < NEARBY[0] else (CLOSE[1], CLOSE[2])
-        pose[0], pose[1] = goal[0], goal[1]
-        for attempt in range(TRIES):
-            distance = farthest * rest[3 * attempt]
-            angle = 2 * math.pi * rest[3 * attempt + 1]
-            if behind:
-                distance = farthest * math.sqrt(rest[3 * attempt])  # more of the far ones
-                angle = goal[2] + math.pi + BEHIND[3] * (angle / math.pi - 1)
-            x, y = goal[0] + distance * math.cos(angle), goal[1] + distance * math.sin(angle)
-            if _fits(x, y, place, rects, first_rect, free, origins, radius):
-                pose[0], pose[1] = x, y
-                break
-        yaw = goal[2]
-        if behind and (pose[0] != goal[0] or pose[1] != goal[1]):
-            yaw = math.atan2(goal[1] - pose[1], goal[0] - pose[0])
-        yaw += (2 * draws[k, 2] - 1) * turn
-        pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi
-
-
-@numba.njit(cache=True)
-def _place_to_recognise(draws, places, cells, first_cell, rects, first_rect, free, origins, radius,
-                        poses, goal_poses):
-    """As `_place`, in the mixture `RECOGNITION`."""
-    kinds = (THERE, BESIDE, ASKEW, TURNED)
-    usual = draws.copy()
-    for k in range(len(places)):
-        kind = draws[k, 1]
-        if kind < SEEN:  # `NEARBY` and `BEHIND` by the usual rules, half and half
-            within = kind / SEEN
-            usual[k, 1] = (2 * within * NEARBY[0] if within < 0.5 else
-                           NEARBY[0] + CLOSE[0] + (2 * within - 1) * BEHIND[0])
-        else:
-            usual[k, 1] = 1.0  # anywhere, unless one of the kinds below
-    _place(usual, places, cells, first_cell, rects, first_rect, free, origins, radius, poses,
-           goal_poses)
-    for k in range(len(places)):
-        begin = SEEN
-        for share, nearest, farthest, least, most in kinds:
-            if begin <= draws[k, 1] < begin + share:
-                _stand_about(poses[k], goal_poses[k], draws[k, 2], draws[k, 3 + 2 * TRIES:],
-                             nearest, farthest, least, most, places[k], rects, first_rect, free,
-                             origins, radius)
-            begin += share
-
-
-@numba.njit(cache=True)
-def _stand_about(pose, goal, turn, rest, nearest, farthest, least, most, place, rects, first_rect,
-                 free, origins, radius):
-    """A robot [4] between two distances from a goal [4], its heading off by two limits.
-
-    Where it fits nowhere it stays where it is.
-    """
-    for attempt in range(TRIES):
-        # As dense over the ring's area everywhere.
-        distance = math.sqrt(nearest**2 + (farthest**2 - nearest**2) * rest[3 * attempt])
-        angle = 2 * math.pi * rest[3 * attempt + 1]
-        x, y = goal[0] + distance * math.cos(angle), goal[1] + distance * math.sin(angle)
-        if _fits(x, y, place, rects, first_rect, free, origins, radius):
-            pose[0], pose[1] = x, y
-            off = (2 * turn - 1) * (most - least)
-            yaw = goal[2] + off + (least if off >= 0 else -least)
-            pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi
-            break
