@@ -108,7 +108,7 @@ def chart(tasks: list[str]) -> None:
     """A panel for each task: the curve over minutes, random actions, the shortest path."""
     names = [('fast, while learning (dashed: inside the curriculum)', 'c0'),
              ('random actions', 'c1'), ('shortest path', 'c2')]
-    across = 3
+    across = 2
     shapes, used = legend(names, EDGE, 12, across * (WIDTH + EDGE))
     for k, task in enumerate(tasks):
         title, metric, *_ = TASKS[task]
@@ -125,7 +125,7 @@ def chart(tasks: list[str]) -> None:
         top_value = max(1.0, max(float(s.high.max()) for s in series) * 1.05)
         low_value = min(0.0, min(float(s.low.min()) for s in series) * 1.05)
         shapes += panel((left, top, left + WIDTH, top + HEIGHT), series,
-                        title=f'{title} / minutes', y_range=(low_value, top_value), log=False)
+                        title=f'{title}, over minutes', y_range=(low_value, top_value), log=False)
     lines = -(-len(tasks) // across)
     picture = to_picture(shapes, EDGE + across * (WIDTH + EDGE), 50 + used + lines * (HEIGHT + 70))
     cv2.imwrite(str(CHART), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

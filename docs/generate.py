@@ -23,6 +23,7 @@ WHOLE_FILES = {  # source: its page
     'CONTRIBUTING.md': 'contributing',
     'models/house/README.md': 'model_house',
     'models/anywhere/README.md': 'model_anywhere',
+    'models/search/README.md': 'model_search',
 }
 LINK = re.compile(r'(!?)\[([^\]]*)\]\(([^)\s]+)\)')
 
