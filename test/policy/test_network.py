@@ -12,12 +12,13 @@ from vn_nav.errors import UserError
 from vn_nav.observation import Observation
 from vn_nav.policy.memory import RecurrentState, stack_frames
 from vn_nav.policy.network import Policy
-from vn_nav.policy.network_config import ARCHITECTURES, HEADS, NetworkConfig
+from vn_nav.policy.network_config import ARCHITECTURES, HEADS, SEARCH, NetworkConfig
 from vn_nav.robot import DRIVE_ACTIONS
 
 SMALL = NetworkConfig(actions=DRIVE_ACTIONS, size=36, channels=(8, 8, 8), features=24, hidden=16)
 # Of icra2017, which has no heads, test_icra2017.py says the same.
-OURS = [name for name in ARCHITECTURES if name != 'icra2017']
+# Those with an actor and a memory of their own; search has neither (test_search_network.py).
+OURS = [name for name in ARCHITECTURES if name not in ('icra2017', SEARCH)]
 MOVES = ((0.5, 0.0, 0.0), (-0.2, 0.0, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, -0.5))
 EVERY = [(name, frames) for name in OURS for frames in (1, 3)]
 
