@@ -15,6 +15,8 @@ from vn_nav.policy.export import export_onnx
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.runtime import _check_stop_threshold
+from vn_nav.policy.search import costmap, grid
+from vn_nav.policy.search.driver import SearchDriver
 from vn_nav.policy.search.look import (
     BINS,
     COLUMNS,
@@ -170,3 +172,21 @@ def test_it_declares_and_chooses_no_action():
 def test_what_a_configuration_must_not_say(changes, rule):
     with pytest.raises(UserError, match=rule):
         dataclasses.replace(CONFIG, **changes)
+
+
+def test_nothing_is_compiled_while_a_robot_drives():
+    """Decisions have 0.1 s: whoever makes the driver waits for the compiler, once."""
+    kernels = (grid._integrate, grid._disc, grid._expect, costmap._dijkstra,
+               costmap._free_length)
+    driver = SearchDriver(build_policy(CONFIG), 2)
+    before = [set(kernel.signatures) for kernel in kernels]
+    assert all(before)
+    rng = np.random.default_rng(0)
+    last, starts = np.full(2, -1), np.ones(2, bool)
+    goals = driver.network.encode_goals(torch.zeros(2, 3, 48, 48, dtype=torch.uint8))
+    for _ in range(30):
+        image = rng.integers(0, 256, (2, 3, 48, 48), dtype=np.uint8)
+        last = driver.act(image, goals, last, starts, rng.normal(0, 1, (2, 3)))
+        starts = np.zeros(2, bool)
+        assert ((last >= 0) & (last < len(CONFIG.actions))).all()
+    assert [set(kernel.signatures) for kernel in kernels] == before

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
-from vn_nav.policy.search.look import RANGE_EDGES, Look, column_bearings
+from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.searcher import Rules, Searcher, Sight
 
@@ -33,6 +33,16 @@ class SearchDriver:
                           for _ in range(num_envs)]
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self._before: np.ndarray | None = None
+        self._compile(Searcher(config.moves, bearings, RANGE_EDGES, config.footprint))
+
+    @staticmethod
+    def _compile(searcher: Searcher) -> None:
+        """Decide a little: else the first decision on a robot would be seconds late."""
+        for co_visible in (0.0, 0.99):
+            sight = Sight(np.eye(BINS, dtype=np.float32)[np.full(COLUMNS, BINS - 8)],
+                          np.array([1.0, 0.0]), 0.3, np.array([1.0, 0.0]), co_visible, 0.0)
+            for action in (-1, int(np.argmax(searcher.moves[:, 0]))):  # the second meets something
+                searcher.step(sight, action, np.zeros(3))
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,

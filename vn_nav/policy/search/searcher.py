@@ -189,7 +189,7 @@ class Searcher:
             self.hypotheses.refute(own)
             return None
         self.aim = 'follow'
-        return self._drive(field, costmap, here)
+        return self._drive(field, costmap)
 
     def _explore(self, costmap: Costmap, here: tuple[int, int]) -> int | None:
         """Towards unknown floor, or a turn that shows some."""
@@ -210,7 +210,7 @@ class Searcher:
             if np.isfinite(away) and (price[best] > 50 or away < price[best]):
                 if self._sees_nothing_new():
                     self.grid.give_up(_foot_of(field, here), ROOM)
-                drive = self._drive(field, costmap, here)
+                drive = self._drive(field, costmap)
         if drive is not None:
             self.aim = 'explore'
             return drive
@@ -228,7 +228,7 @@ class Searcher:
         self._known.clear()
         return True
 
-    def _drive(self, field: np.ndarray, costmap: Costmap, here: tuple[int, int]) -> int | None:
+    def _drive(self, field: np.ndarray, costmap: Costmap) -> int | None:
         """The first action of turns and a move that lead on best; None: none does."""
         rules = self.rules
         most = math.ceil(math.pi / self._turn)
