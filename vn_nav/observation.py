@@ -14,6 +14,8 @@ import numpy as np
 
 from vn_nav.errors import UserError
 
+OUTSIDE_GREY = 120  # grey level of a square picture where the camera's own does not reach
+
 
 class Observation(NamedTuple):
     """What the network may see (and nothing else). Leading dimensions are [T,B] or [B]."""

@@ -37,6 +37,7 @@ class Stream(enum.IntEnum):
     VIEW = 20  # of a recorded place
     VIEW_APPEARANCE = 21
     EPISODE_ODOMETRY = 22  # errors of odometry, of a decision; ODOMETRY: of a tick
+    PAIR_LENS = 23
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

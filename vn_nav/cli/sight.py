@@ -45,6 +45,7 @@ def run(args: argparse.Namespace, config: TrainConfig) -> int:
         raise UserError('the preset search learns on the processor', config.device,
                         'use --device cpu')
     from vn_nav.robot import load_robot
+    from vn_sim_bridge.datasets.lenses import Lenses
     from vn_sim_bridge.datasets.pair_poses import RECOGNITION
     from vn_sim_bridge.datasets.view_pairs import PairSampler
     from vn_sim_bridge.render.randomisation import load_randomisation
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace, config: TrainConfig) -> int:
     with contextlib.ExitStack() as open_now:
         print(f'opens {len(scenes)} scenes to learn from, and {len(others)} others to judge by',
               flush=True)
-        source = PairSampler(scenes, seed=args.seed, **options)
+        source = PairSampler(scenes, seed=args.seed, lenses=Lenses(), **options)
         open_now.callback(source.simulator.close)
         validation = PairSampler(others, seed=args.seed + 1, **options)
         open_now.callback(validation.simulator.close)

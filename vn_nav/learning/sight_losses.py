@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from vn_nav.learning.auxiliary import POSE_OVERLAP
 from vn_nav.learning.returns import masked_mean
+from vn_nav.policy.search.lens import SAME
 from vn_nav.policy.search.look import range_classes
 from vn_nav.policy.search.network import Recognition, SearchPolicy
 
@@ -45,7 +46,8 @@ def recognition_losses(said: Recognition, batch: dict[str, np.ndarray]) -> dict[
     """Negative log-likelihoods: of the pose where the pictures overlap, of co-visibility, arrival.
 
     The position's is halved, and the distance by which its centre is off [m] added.
-    An overlap below 0 is unknown, and teaches arrival alone.
+    An overlap below 0 is unknown, and teaches arrival alone. Through another lens than the known
+    one arrival follows from the pose (`vn_nav.policy.search.lens`), and its head learns nothing.
     """
     truth, overlap = torch.from_numpy(batch['goal_pose']), torch.from_numpy(batch['overlap'])
     sees, known = overlap >= POSE_OVERLAP, overlap >= 0
@@ -56,12 +58,13 @@ def recognition_losses(said: Recognition, batch: dict[str, np.ndarray]) -> dict[
     kappa = said.log_concentration.exp()
     off = 1 - (said.heading * truth[:, 2:]).sum(1)  # 1 - cosine of the error
     heading = kappa * off + torch.log(torch.special.i0e(kappa))
+    own_lens = (torch.from_numpy(batch['zoom']) - 1).abs() < SAME
+    there = F.binary_cross_entropy_with_logits(
+        said.arrived, torch.from_numpy(batch['arrived']).float(), reduction='none')
     shown = F.binary_cross_entropy_with_logits(said.co_visible, sees.float(), reduction='none')
     return {
         'position': masked_mean(position, sees), 'heading': masked_mean(heading, sees),
-        'co_visible': masked_mean(shown, known),
-        'arrived': F.binary_cross_entropy_with_logits(
-            said.arrived, torch.from_numpy(batch['arrived']).float()),
+        'co_visible': masked_mean(shown, known), 'arrived': masked_mean(there, own_lens),
     }
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from vn_nav.errors import UserError
 from vn_nav.files import write_file
+from vn_nav.learning.augmentation import augment
 from vn_nav.learning.log import METRICS
 from vn_nav.learning.sight_figures import FIGURES, Judged, figures, judge
 from vn_nav.learning.sight_losses import WEIGHTS, losses
@@ -53,6 +54,7 @@ class SightConfig:
 
     pairs: int = 40_000_000
     minutes: float | None = None  # wall-clock, drawing included
+    augment: bool = True  # pictures to learn from, see `vn_nav.learning.augmentation`
     groups: int = 64  # of a goal and a robot each, in a step: two pairs each
     learning_rate: float = 8e-4  # at the start
     final_learning_rate: float = 2e-5  # falls linearly to it
@@ -66,7 +68,7 @@ class SightConfig:
     def __post_init__(self):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if field.name != 'seed' and not (value is None or value > 0):
+            if field.name not in ('seed', 'augment') and not (value is None or value > 0):
                 raise UserError(f'{field.name} of a training of search is positive', value,
                                 'correct it')
 
@@ -145,7 +147,10 @@ class _Training:
             self._report(held_out, say)
             self._save()  # from here on there is something to resume
         while self.share < 1:
-            self._learn(self._draw(self.source, self.config.groups))
+            batch = self._draw(self.source, self.config.groups)
+            if self.config.augment:
+                augment(batch['image'], np.random.default_rng((self.config.seed, self.steps)))
+            self._learn(batch)
             self.steps += 1
             self._lap()
             if self.steps % self.config.report_every == 0:

@@ -10,8 +10,15 @@ import numpy as np
 
 from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
+from vn_nav.policy.search.lens import (
+    bearings_through,
+    squeezed_pose,
+    squeezed_ranges,
+    zoom_of,
+)
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
+from vn_sim_bridge.datasets.lenses import Lenses, cut
 from vn_sim_bridge.datasets.pair_poses import PLACERS, TRIES, USUAL
 from vn_sim_bridge.datasets.view_ranges import ranges_of_depth, ray_cast
 from vn_sim_bridge.floor.distance import FloorDistance
@@ -43,6 +50,8 @@ class PairSampler:
         mix: of `pair_poses.PLACERS`, how robots stand: 'usual' as above, or 'recognition':
             about half there or where the goal is likely seen, a fifth nearly there (`BESIDE`,
             `ASKEW`), the rest in the same room turned away (`TURNED`) or anywhere.
+        lenses: of the groups of `draw_groups`, where the simulator draws cameras; None: all
+            have the robot's.
 
     Raises:
         UserError: no scene, an unknown mix, or a simulator that cannot look from anywhere.
@@ -50,7 +59,7 @@ class PairSampler:
 
     def __init__(self, scenes: Sequence[str], size: int = 84, robot: RobotSpec | None = None,
                  randomisation: Randomisation | None = None, seed: int = 0, threads: int = 1,
-                 mix: str = USUAL):
+                 mix: str = USUAL, lenses: Lenses | None = None):
         if len(scenes) < 1:
             raise UserError('there is at least one scene', scenes, 'name some')
         if mix not in PLACERS:
@@ -71,6 +80,7 @@ class PairSampler:
             self.simulator.close()
             raise UserError('light and camera vary in simulators that draw them',
                             'a randomisation', 'leave it out, or choose another simulator')
+        self._lenses = lenses if can.appearance else None
         # On a grid robots stand where episodes may begin, and nowhere else.
         self._stands = None if can.continuous else [place.starts() for place in self.places]
         floors = list(map(standing_room, self.places))
@@ -136,6 +146,8 @@ class PairSampler:
             goal_pose: [K,4], overlap: [K], of the pairs, as `draw` returns them.
             With bearings also arrived: [K] bool, of the pairs, and ranges: [V,C] float32 m from
             the robot's centre to the first obstacle, `vn_sim_bridge.datasets.view_ranges`.
+            zoom: [K] float32 of the pairs' lens. Where it is not 1, goal_pose and ranges are
+            those of the squeezed place of `vn_nav.policy.search.lens`; `arrived` is as it is.
         """
         if count < 1 or robots < 1:
             raise UserError('a draw has at least one group, and that one robot', (count, robots),
@@ -150,8 +162,17 @@ class PairSampler:
         numbers = np.concatenate([numbers[::robots, None], numbers.reshape(count, robots)], 1)
         views = np.tile(np.arange(size) == 0, count)  # as in `draw`: a goal is 1, a robot 0
         poses, numbers = poses.reshape(-1, 4), numbers.reshape(-1)
+        zoom = np.ones(len(poses))
+        aspects, off = zoom, None
+        if self._lenses is not None:
+            fovs, shares, masts = self._lenses.draw(self._seed, numbers[::size], self.robot)
+            off = (np.repeat(fovs - self.robot.camera_fov, size),
+                   np.repeat(masts - self.robot.camera_height, size))
+            zoom = np.repeat([zoom_of(own, self.robot.camera_fov) for own in fovs], size)
+            aspects = np.repeat(shares, size)
         frames, (cameras, fov) = self._look(np.repeat(place[::robots], size), poses, numbers,
-                                            views.astype(np.int64))
+                                            views.astype(np.int64), off)
+        cut(frames, aspects)
         points = lift(frames.depth, cameras, fov)
         first, second = np.nonzero(~np.eye(size, dtype=bool))
         start = size * np.arange(count)[:, None]
@@ -159,25 +180,32 @@ class PairSampler:
         found = {
             'image': frames.rgb, 'depth': frames.depth, 'segmentation': frames.labels,
             'first': first, 'second': second,
-            'goal_pose': relative_pose(poses[first], poses[second]),
+            'goal_pose': squeezed_pose(relative_pose(poses[first], poses[second]), zoom[first]),
+            'zoom': zoom[first].astype(np.float32),
             'overlap': co_visible(points[second], frames.depth[first], cameras[first], fov[first]),
         }
         if bearings is not None:
             where = np.repeat(place[::robots], size)
             found |= {
                 'arrived': self.arrived(where[first], poses[first], poses[second]),
-                'ranges': self._ranges(where, poses, bearings, frames.depth, cameras, fov)}
+                'ranges': squeezed_ranges(self._ranges(
+                    where, poses, bearings_through(bearings, zoom[:, None]), frames.depth, cameras,
+                    fov), np.asarray(bearings, float), zoom)}
         return found
 
     def _ranges(self, place: np.ndarray, poses: np.ndarray, bearings: np.ndarray,
                 depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray) -> np.ndarray:
-        """Of views, [V,C] float32: by the places' walls where they have some, else by depth."""
+        """Of views, [V,C] float32: by the places' walls where they have some, else by depth.
+
+        Along bearings [V,C].
+        """
         rects, first_rect = self._floors[2:4]
-        found = ray_cast(poses, place, np.asarray(bearings, float), rects, first_rect)
+        found = ray_cast(poses, place, bearings, rects, first_rect)
         open_air = np.flatnonzero(first_rect[place] == first_rect[place + 1])
         if len(open_air):
             found[open_air] = ranges_of_depth(
-                depth[open_air], cameras[open_air], fov[open_air], poses[open_air, 2], bearings)
+                depth[open_air], cameras[open_air], fov[open_air], poses[open_air, 2],
+                bearings[open_air])
         return found
 
     def poses(self, numbers: np.ndarray, robots: int = 1
@@ -233,10 +261,16 @@ class PairSampler:
             distance[k] = field.at(poses[k:k + 1, :2])[0]
         return tasks.arrived(distance, error)
 
-    def _look(self, place, poses, numbers, view: int | np.ndarray
-              ) -> tuple[Frames, tuple]:
-        """Pictures from poses, and the cameras that took them; `view` tells the two apart."""
+    def _look(self, place, poses, numbers, view: int | np.ndarray,
+              off: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Frames, tuple]:
+        """Pictures from poses, and the cameras that took them; `view` tells the two apart.
+
+        `off` is added to their fields of view [rad] and heights [m].
+        """
         appearance = self.simulator.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
+        if off is not None:
+            appearance = appearance._replace(fov=appearance.fov + off[0],
+                                             height=appearance.height + off[1])
         frames = self.simulator.view(place, poses, None, appearance,
                                      key(self._seed, Stream.PAIR_SENSOR, numbers, view))
         return frames, self.simulator.cameras(poses, appearance)

@@ -18,16 +18,16 @@ def ray_cast(poses, place, bearings, rects, first_rect):
     Args:
         poses: [V,4] x, y [m], yaw [rad], and pitch.
         place: [V] whose obstacles.
-        bearings: [C] rad off the heading, positive to the left.
+        bearings: [V,C] rad off the heading, positive to the left.
         rects: [M,4] x0, y0, x1, y1 [m] of the obstacles of all places.
         first_rect: [P+1] where those of each place begin.
     """
-    found = np.empty((len(poses), len(bearings)), np.float32)
+    found = np.empty(bearings.shape, np.float32)
     for n in range(len(poses)):
         x, y = poses[n, 0], poses[n, 1]
         begin, end = first_rect[place[n]], first_rect[place[n] + 1]
-        for c in range(len(bearings)):
-            angle = poses[n, 2] + bearings[c]
+        for c in range(bearings.shape[1]):
+            angle = poses[n, 2] + bearings[n, c]
             dx, dy = math.cos(angle), math.sin(angle)
             # A ray along an axis meets no edge across it: as good as infinitely far.
             along = 1 / dx if abs(dx) > 1e-12 else math.copysign(1e12, dx)
@@ -56,7 +56,7 @@ def ranges_of_depth(depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray, yaw
         depth: [V,S,S] float32 m along the optical axis, 0 where nothing is seen.
         cameras: [V,5] x, y, z [m], yaw (left), pitch (down) [rad]; fov: [V] rad, as of
             `vn_nav.co_visibility.lift`.
-        yaw: [V] rad, nominal headings, which the bearings [C] are off, evenly in their tangents.
+        yaw: [V] rad, nominal headings, which the bearings [V,C] are off, evenly in their tangents.
     """
     slopes = np.tan(np.asarray(bearings, float))
     return _ranges_of_depth(depth, np.ascontiguousarray(cameras), np.asarray(fov, float),
@@ -66,12 +66,12 @@ def ranges_of_depth(depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray, yaw
 @numba.njit(cache=True)
 def _ranges_of_depth(depth, cameras, fov, yaw, slopes):
     count, size = depth.shape[0], depth.shape[1]
-    columns = len(slopes)
-    step = slopes[1] - slopes[0] if columns > 1 else 0.1
+    columns = slopes.shape[1]
     found = np.full((count, columns), np.nan, np.float32)
     for n in range(count):
         focal = size / 2 / math.tan(fov[n] / 2)
         cp, sp = math.cos(cameras[n, 4]), math.sin(cameras[n, 4])
+        step = slopes[n, 1] - slopes[n, 0] if columns > 1 else 0.1
         turn = cameras[n, 3] - yaw[n]
         ct, st = math.cos(turn), math.sin(turn)
         for row in range(size):
@@ -85,7 +85,7 @@ def _ranges_of_depth(depth, cameras, fov, yaw, slopes):
                 ahead, left = ct * ahead - st * left, st * ahead + ct * left
                 if ahead <= 0.0:
                     continue
-                place = (left / ahead - slopes[0]) / step
+                place = (left / ahead - slopes[n, 0]) / step
                 index = int(math.floor(place + 0.5))
                 if 0 <= index < columns:
                     away = math.hypot(ahead, left)

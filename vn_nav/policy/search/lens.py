@@ -1,0 +1,96 @@
+"""Lenses narrower, or wider, than the one that the networks of `search` know.
+
+A picture through a lens that magnifies `zoom` times shows a point (forward x, left y) where the
+known lens would show one at (x / zoom, y): the place as if it were squeezed in depth. The networks
+speak of that squeezed place, whatever the lens; here it is turned into metres and back. Turned
+cameras fit that picture only nearly: the networks learn it through many lenses.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, arrival_by_pose
+
+SAME = 0.05  # a zoom off 1 by less is none
+_LOG_STEP = math.log(RANGE_EDGES[1] / RANGE_EDGES[0])
+
+
+def zoom_of(fov: float, known: float) -> float:
+    """How many times a lens magnifies against the known one, of fields of view [rad]."""
+    return math.tan(known / 2) / math.tan(fov / 2)
+
+
+def squeezed_pose(goal_pose: np.ndarray, zoom: np.ndarray) -> np.ndarray:
+    """Poses [K,4] as of `vn_nav.co_visibility.relative_pose`, as the networks see them.
+
+    Args:
+        goal_pose: [K,4] x, y [m], cosine, sine; zoom: [K].
+    """
+    squeezed = np.array(goal_pose, np.float32)
+    squeezed[:, 0] /= zoom
+    squeezed[:, 3] *= zoom
+    squeezed[:, 2:] /= np.hypot(squeezed[:, 2], squeezed[:, 3])[:, None]
+    return squeezed
+
+
+def bearings_through(bearings: np.ndarray, zoom: np.ndarray | float) -> np.ndarray:
+    """True bearings of the picture columns that have these bearings [rad] in the known lens."""
+    return np.arctan(np.tan(bearings) / zoom)
+
+
+def squeezed_ranges(ranges: np.ndarray, bearings: np.ndarray, zoom: np.ndarray) -> np.ndarray:
+    """Ranges [V,C] m along `bearings_through`, as the networks see them.
+
+    Args:
+        ranges: [V,C] m; bearings: [C] rad of the columns in the known lens; zoom: [V].
+    """
+    true = bearings_through(bearings, zoom[:, None])
+    return (ranges * np.cos(true) / zoom[:, None] / np.cos(bearings)).astype(np.float32)
+
+
+def in_metres(look: Look, bearings: np.ndarray, zoom: float) -> Look:
+    """What the networks say, of the place as it is.
+
+    Whether the robot has arrived follows from the pose: the head knows it of the known lens alone.
+
+    Args:
+        look: of N pictures through one lens.
+        bearings: [C] rad of the columns in the known lens.
+        zoom: of the lens.
+    """
+    if abs(zoom - 1) < SAME:
+        return look
+    cosine, sine = look.heading[:, 0], look.heading[:, 1] / zoom
+    length = torch.sqrt(cosine.square() + sine.square()).clamp(min=1e-6)
+    heading = torch.stack([cosine, sine], 1) / length[:, None]
+    # d(true) / d(squeezed) of the angle; the spread grows to that of the worse axis.
+    heading_sigma = look.heading_sigma / zoom / length.square()
+    position = look.position * torch.tensor([zoom, 1.0])
+    sigma = look.position_sigma * max(zoom, 1.0)
+    arrived = arrival_by_pose(position, sigma, heading, heading_sigma) * torch.sigmoid(
+        look.co_visible)
+    stretch = zoom * np.cos(bearings) / np.cos(bearings_through(bearings, zoom))
+    return Look(_shifted(look.ranges, torch.from_numpy(np.log(stretch)).float()), position, sigma,
+                heading, heading_sigma, look.co_visible, torch.logit(arrived, 1e-6))
+
+
+def _shifted(log_probabilities: Tensor, logs: Tensor) -> Tensor:
+    """Distributions [N,COLUMNS,BINS] of ranges whose logarithm is so much greater, [COLUMNS]."""
+    below = log_probabilities.exp().cumsum(-1)  # up to each bin's far edge; the last has none
+    place = torch.arange(BINS - 1) - logs[:, None] / _LOG_STEP  # [COLUMNS,BINS-1] where to read
+    low = place.floor().long()
+    share = (place - low).float()
+    # The first bin reaches down to nothing, the last one up to anything.
+    ends = torch.cat([torch.zeros_like(below[..., :1]), below[..., :-1]], -1)
+    at = (low + 1).clamp(0, BINS - 1).expand(len(below), COLUMNS, BINS - 1)
+    after = (low + 2).clamp(0, BINS - 1).expand(len(below), COLUMNS, BINS - 1)
+    read = ends.gather(-1, at) * (1 - share) + ends.gather(-1, after) * share
+    one = torch.ones_like(read[..., :1])
+    probabilities = torch.diff(torch.cat([0 * one, read, one], -1), dim=-1)
+    return probabilities.clamp(min=1e-7).log()
+

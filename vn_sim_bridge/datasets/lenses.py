@@ -1,0 +1,54 @@
+"""Cameras of picture pairs: robots have other lenses, formats and heights than the standard one."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from vn_nav.observation import OUTSIDE_GREY
+from vn_nav.robot import RobotSpec
+from vn_sim_bridge.counter_random import Stream, uniform
+from vn_sim_bridge.simulator import Frames
+
+
+@dataclasses.dataclass(frozen=True)
+class Lenses:
+    """What is drawn for each group of views, which share a camera."""
+
+    share: float = 0.4  # of the groups that have another lens than the robot's
+    fov_deg: tuple[float, float] = (55.0, 100.0)  # horizontal, drawn between
+    wide_share: float = 0.25  # of the groups whose pictures are wider than high
+    least_aspect: float = 0.5  # height of the picture, in widths
+    mast_share: float = 0.25  # of the groups whose cameras are at another height
+    mast: tuple[float, float] = (0.3, 1.5)  # m above the floor, drawn between
+
+    def draw(self, seed: int, groups: np.ndarray, robot: RobotSpec
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fields of view [K] rad, heights of the pictures [K] in widths, and of the cameras [K] m.
+
+        Args:
+            seed: of the draws; groups: [K] their numbers; robot: whose camera is the usual one.
+        """
+        draws = uniform(seed, Stream.PAIR_LENS, groups[:, None], 0, np.arange(6))
+        low, high = map(math.radians, self.fov_deg)
+        fovs = np.where(draws[:, 0] < self.share, low + (high - low) * draws[:, 1],
+                        robot.camera_fov)
+        aspects = np.where(draws[:, 2] < self.wide_share,
+                           self.least_aspect + (1 - self.least_aspect) * draws[:, 3], 1.0)
+        low, high = self.mast
+        masts = np.where(draws[:, 4] < self.mast_share, low + (high - low) * draws[:, 5],
+                         robot.camera_height)
+        return fovs, aspects, masts
+
+
+def cut(frames: Frames, aspects: np.ndarray) -> None:
+    """Take away, in place, what lies above and below pictures [K] of such heights in widths."""
+    size = frames.rgb.shape[-1]
+    for k in np.flatnonzero(aspects < 1):
+        edge = round(size * (1 - aspects[k]) / 2)
+        for rows in (slice(0, edge), slice(size - edge, size)):
+            frames.rgb[k, :, rows] = OUTSIDE_GREY
+            frames.depth[k, rows] = 0
+            frames.labels[k, rows] = 0
