@@ -28,6 +28,7 @@ class Costmap:
     Args:
         grid: the map.
         off: m by which obstacles are passed closer than the footprint, where all else failed.
+        felt: what the robot has touched counts as well.
 
     Attributes:
         clearance: [SIDE,SIDE] m to the nearest obstacle.
@@ -36,9 +37,11 @@ class Costmap:
         cost: [SIDE,SIDE] float32 of a metre; 0 where it is not passable.
     """
 
-    def __init__(self, grid: OccupancyGrid, off: float = 0.0):
+    def __init__(self, grid: OccupancyGrid, off: float = 0.0, felt: bool = True):
         self.grid = grid
         obstacles = grid.obstacles()
+        if not felt:
+            obstacles &= ~grid.contacts
         self.clearance = CELL * cv2.distanceTransform(
             (~obstacles).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         limit = grid.footprint + (KEEP if off == 0 else -off)
@@ -79,7 +82,7 @@ class Costmap:
         Args:
             pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
         """
-        return _free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
+        return free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
                             float(pose[1]), angle, length)
 
 
@@ -125,7 +128,7 @@ def _dijkstra(price, cells, costs, row0, column0):
 
 
 @numba.njit(cache=True)
-def _free_length(passable, clearance, origin, x, y, angle, length):
+def free_length(passable, clearance, origin, x, y, angle, length):
     side = passable.shape[0]
     dx, dy = math.cos(angle), math.sin(angle)
     count = max(int(math.ceil(length / (0.5 * CELL))), 1)
