@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from vn_nav.errors import UserError
+from vn_nav.policy.checkpoint import save_checkpoint
+from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime
 from vn_nav.policy.search.lens import (
     bearings_through,
     in_metres,
@@ -23,6 +27,8 @@ from vn_nav.policy.search.look import (
     median_ranges,
     range_classes,
 )
+from vn_nav.policy.zhu_policy import build_policy
+from vn_nav.robot import RobotSpec
 
 KNOWN = math.radians(90)
 BEARINGS = column_bearings(KNOWN)
@@ -136,3 +142,52 @@ def test_the_squeezed_place_is_what_the_known_lens_would_show():
     squeezed = squeezed_ranges(through_long[None], BEARINGS, np.array([zoom]))[0]
     assert np.allclose(squeezed, by_known, rtol=1e-5)
     assert (range_classes(squeezed) == range_classes(by_known)).mean() > 0.95
+
+
+@pytest.fixture(scope='module')
+def checkpoint(tmp_path_factory):
+    robot = RobotSpec().with_actions(('forward', 'rotate_left', 'rotate_right'))
+    torch.manual_seed(0)
+    network = build_policy(NetworkConfig(
+        actions=robot.action_names, moves=robot.moves, size=48, architecture='search',
+        channels=(8, 12, 8), features=24, blocks=1, view=KNOWN,
+        footprint=robot.footprint_radius)).eval()
+    folder = tmp_path_factory.mktemp('search') / 'model'
+    save_checkpoint(folder, network, {
+        'world_version': '1', 'camera_fov_deg': 90.0, 'camera_height': 1.0})
+    return folder, network
+
+
+def test_the_map_is_drawn_through_the_lens_of_the_robot(checkpoint):
+    """The same picture through a longer lens: a narrower cone of floor, farther away."""
+    folder, network = checkpoint
+    picture = np.random.default_rng(0).integers(0, 255, (3, 48, 48), np.uint8)
+    known = []
+    for zoom in (1.0, 2.0):
+        runtime = PolicyRuntime(folder)
+        runtime.set_goal(picture)
+        runtime.act(picture, None, zoom)
+        searcher = runtime.search.searchers[0]
+        assert np.allclose(searcher.bearings, bearings_through(BEARINGS, zoom))
+        known.append(searcher.grid.known_area())
+        batched = BatchedPolicy(network, 1, zoom=zoom)
+        batched.act({'image': picture[None], 'goal_index': np.zeros(1, int),
+                     'last_action': np.array([-1]), 'last_reward': np.zeros(1, np.float32)},
+                    picture[None], np.array([True]))
+        assert batched.search.searchers[0].grid.known_area() == known[-1]
+        assert batched.arrival[0] == pytest.approx(runtime.arrival, abs=1e-6)
+    assert known[0] != known[1]
+
+
+def test_a_camera_is_prepared_for_the_policy_that_takes_it(checkpoint):
+    runtime = PolicyRuntime(checkpoint[0])
+    picture = np.random.default_rng(0).integers(0, 255, (90, 160, 3), np.uint8)
+    short = 2 * math.atan(90 / 160 * math.tan(math.radians(30)))  # 60 deg across
+    image, zoom = runtime.prepare(picture, short)
+    assert image.shape == (3, 48, 48) and zoom == pytest.approx(math.sqrt(3))
+    assert runtime.prepare(picture)[1] == 1.0  # nobody says what lens it is
+    runtime.check_camera(short, 160 / 90)
+    with pytest.raises(UserError, match='horizontally'):
+        runtime.check_camera(math.radians(30), 1.0)
+    goal, same = runtime.prepare(picture, math.radians(50), zoom)
+    assert same == zoom and goal.shape == image.shape
