@@ -19,7 +19,8 @@ KNOWN = math.radians(90)
 BEARINGS = column_bearings(KNOWN)
 SCENES = house_scenes((7, 8), 3)
 LENS_DEG = math.degrees(2 * math.atan(1 / 1.5))  # magnifies 1.5 times
-NARROW = Lenses(share=1.0, fov_deg=(LENS_DEG, LENS_DEG), wide_share=0.0, mast_share=0.0)
+USUAL = {'share': 0.0, 'wide_share': 0.0, 'mast_share': 0.0, 'pitched_share': 0.0}
+NARROW = Lenses(**USUAL | {'share': 1.0}, fov_deg=(LENS_DEG, LENS_DEG))
 
 
 def sampler(lenses):
@@ -87,10 +88,32 @@ def test_labels_through_a_long_lens_are_those_of_the_squeezed_place():
 
 def test_formats_and_heights_change_pictures_and_leave_poses():
     plain = sampler(None).draw_groups(12, 1, bearings=BEARINGS)
-    for lenses in (Lenses(0.0, wide_share=1.0, mast_share=0.0),
-                   Lenses(0.0, wide_share=0.0, mast_share=1.0)):
-        groups = sampler(lenses).draw_groups(12, 1, bearings=BEARINGS)
+    for kind in ('wide_share', 'mast_share', 'pitched_share'):
+        groups = sampler(Lenses(**USUAL | {kind: 1.0})).draw_groups(12, 1, bearings=BEARINGS)
         assert (groups['zoom'] == 1).all()
         assert np.array_equal(groups['goal_pose'], plain['goal_pose'])
         assert np.allclose(groups['ranges'], plain['ranges'])
         assert not np.array_equal(groups['image'], plain['image'])
+
+
+def test_cameras_look_down_together_or_swayed():
+    lenses = Lenses()
+    groups, views = np.repeat(np.arange(3000), 2), np.tile(np.arange(2), 3000)
+    pitches = np.degrees(lenses.pitches(1, groups, views)).reshape(-1, 2)
+    pitched = (pitches != 0).any(1)
+    assert abs(pitched.mean() - lenses.pitched_share) < 0.03
+    apart = np.abs(np.diff(pitches[pitched], axis=1))[:, 0]
+    assert abs((apart > 0).mean() - lenses.swayed_share) < 0.04
+    assert apart.max() <= 2 * lenses.sway_deg and apart.max() > 1.5 * lenses.sway_deg
+    low, high = lenses.pitch_deg
+    assert pitches.min() >= low - lenses.sway_deg and pitches.max() <= high + lenses.sway_deg
+    assert pitches[pitched].mean() == pytest.approx((low + high) / 2, abs=1.5)
+
+
+def test_a_camera_that_looks_down_shows_more_floor():
+    level, down = (sampler(Lenses(**USUAL | {'pitched_share': share}, pitch_deg=(30.0, 30.0),
+                                  swayed_share=0.0)).draw_groups(12, 1) for share in (0.0, 1.0))
+    nearest = [np.where(own['depth'] > 0, own['depth'], np.inf)[:, -8:].mean()
+               for own in (level, down)]
+    # The lowest rows of a level 90 deg picture meet the floor 1 m ahead; 75 deg down much nearer.
+    assert nearest[1] < 0.8 * nearest[0]
