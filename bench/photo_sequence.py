@@ -56,8 +56,8 @@ class Sequence:
     def __init__(self, folder: Path):
         names = sorted((folder / 'images').glob('*.jpg'))
         if not names or not all((folder / name).exists() for name in ('K.txt', 'poses.txt')):
-            raise UserError('a sequence has images/*.jpg, depth/*.png, K.txt and poses.txt', folder,
-                            'see the heading of bench/photo_sequence.py')
+            raise UserError('a sequence has images/*.jpg, depth/*.png, K.txt and poses.txt',
+                            str(folder), 'see the heading of bench/photo_sequence.py')
         self.images = np.stack([cv2.cvtColor(cv2.imread(str(name)), cv2.COLOR_BGR2RGB)
                                 for name in names])
         self.intrinsics = np.loadtxt(folder / 'K.txt')
