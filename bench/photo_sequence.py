@@ -163,18 +163,18 @@ class Sequence:
             axes[n, 0] + slope[column, None] * axes[n, 1] + slope[row, None] * axes[n, 2])
         _, first = np.unique(np.round(cloud / 0.03).astype(np.int64), axis=0, return_index=True)
         cloud = cloud[first]
-        small = side // BLOCK
+        small = -(-side // BLOCK)
         found = self._depth[chosen].copy()
         inside = self._inside()
         for k, own in enumerate(chosen):
             seen = (cloud - cameras[own, :3]) @ axes[own].T  # ahead, right, down
             seen = seen[seen[:, 0] > 0.3]
-            pixel = np.floor(seen[:, 1:] / seen[:, :1] * focal / BLOCK + small / 2).astype(int)
+            pixel = np.floor((seen[:, 1:] / seen[:, :1] * focal + side / 2) / BLOCK).astype(int)
             fits = ((pixel >= 0) & (pixel < small)).all(1)
             fill = np.full(small * small, np.inf)
             np.minimum.at(fill, pixel[fits, 1] * small + pixel[fits, 0], seen[fits, 0])
             fill[np.isinf(fill)] = 0
-            wide = np.repeat(np.repeat(fill.reshape(small, small), BLOCK, 0), BLOCK, 1)
+            wide = np.kron(fill.reshape(small, small), np.ones((BLOCK, BLOCK)))[:side, :side]
             hole = (found[k] == 0) & inside[own]
             found[k][hole] = wide[hole]
         return found
