@@ -11,6 +11,7 @@ from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.policy.search.lens import zoom_of
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
 from vn_nav.vector_env import MeasuredVectorEnv
@@ -127,7 +128,10 @@ class PolicyActor:
                  threshold: float = STOP_THRESHOLD, known: Sequence[str] = ()):
         self.env, self.threshold = env, threshold
         self.known = known if network.config.scenes > 1 else ()
-        self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
+        self.policy = BatchedPolicy(
+            network, env.num_envs, decoding=decoding, seed=seed,
+            zoom=(max(zoom_of(env.robot.camera_fov, network.config.view), 1.0)
+                  if network.config.architecture == SEARCH else 1.0))
         self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:

@@ -9,7 +9,14 @@ import numpy as np
 import torch
 
 from vn_nav.errors import UserError
-from vn_nav.observation import Observation
+from vn_nav.observation import (
+    Observation,
+    check_lens,
+    crop_fraction,
+    fov_across,
+    preprocess,
+    through_lens,
+)
 from vn_nav.policy.action_filter import FilterCounts, make_filter
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
@@ -123,6 +130,37 @@ class PolicyRuntime:
         self.arrival = math.nan
         self.reset()
 
+    def check_camera(self, fov: float, aspect: float) -> None:
+        """Whether this policy can drive by a camera.
+
+        Args:
+            fov: of the picture's shorter side [rad]; aspect: its width over its height.
+
+        Raises:
+            UserError: it sees too little or, for a policy that searches, too much.
+        """
+        if self.search is None:
+            crop_fraction(fov, self.camera_fov)
+        else:
+            check_lens(fov_across(fov, aspect))
+
+    def prepare(self, picture: np.ndarray, fov: float | None = None, zoom: float | None = None
+                ) -> tuple[np.ndarray, float]:
+        """A camera's picture as `act` and `set_goal` take it, and the `zoom` for `act`.
+
+        Args:
+            picture: [H,W,3] uint8 RGB.
+            fov: of its shorter side [rad]; None: unknown, and taken for the policy's own.
+            zoom: that it has to have, for a goal picture of another camera than the robot's;
+                None: what the camera gives.
+
+        Raises:
+            UserError: see `vn_nav.observation.preprocess` and `through_lens`.
+        """
+        if self.search is None or fov is None:
+            return preprocess(picture, self.size, fov=fov, target_fov=self.camera_fov), 1.0
+        return through_lens(picture, self.size, fov=fov, target_fov=self.camera_fov, zoom=zoom)
+
     def reset(self) -> None:
         """Begin an episode: empty memory, no last action."""
         if self.search is None:
@@ -157,7 +195,7 @@ class PolicyRuntime:
         return self.stop_threshold is not None and self.arrival > self.stop_threshold
 
     @torch.inference_mode()
-    def act(self, image: np.ndarray, odometry: np.ndarray | None = None) -> int:
+    def act(self, image: np.ndarray, odometry: np.ndarray | None = None, zoom: float = 1.0) -> int:
         """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
@@ -169,6 +207,7 @@ class PolicyRuntime:
                 the same until `reset_odometry`, `reset` or `set_goal`; what counts is how it
                 changes. None: unknown at this picture; the frame stays. Of use to a policy that
                 searches alone.
+            zoom: of picture and goal, as `prepare` says.
 
         Raises:
             FloatingPointError: the outputs are not finite; memory and last action stay.
@@ -181,7 +220,7 @@ class PolicyRuntime:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
         if self.search is not None:
-            return self._search_on(picture, odometry)
+            return self._search_on(picture, odometry, zoom)
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -203,12 +242,12 @@ class PolicyRuntime:
             self.reset()
         return action
 
-    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None) -> int:
+    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, zoom: float) -> int:
         """`act` of a policy that searches."""
         assert self.search is not None and self._goal_maps is not None
         action = int(self.search.act(
             picture.numpy(), self._goal_maps, np.array([self._last_action]),
-            np.array([self._starts]), None if odometry is None else odometry[None])[0])
+            np.array([self._starts]), None if odometry is None else odometry[None], zoom)[0])
         self.arrival = float(self.search.arrival[0])
         self._last_action, self._starts = action, False
         if self.arrived:
@@ -232,6 +271,8 @@ class BatchedPolicy:
         num_envs: environments N.
         decoding: 'sample' or 'greedy'.
         seed: of the sampled actions.
+        zoom: how many times the robots' lens magnifies against the policy's, for one that
+            searches; see `vn_nav.policy.search.lens`.
 
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
@@ -242,9 +283,10 @@ class BatchedPolicy:
             changed the action; None where the policy has none.
     """
 
-    def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0):
+    def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0,
+                 zoom: float = 1.0):
         _check_decoding(decoding)
-        self.network, self.decoding = network, decoding
+        self.network, self.decoding, self._zoom = network, decoding, zoom
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self.logits: torch.Tensor | None = None
@@ -293,7 +335,7 @@ class BatchedPolicy:
         last_action, reset_mask = np.asarray(obs['last_action']), np.asarray(reset_mask, bool)
         if self.search is not None:
             chosen = self.search.act(obs['image'], maps, last_action, reset_mask,
-                                     obs.get('odometry'))
+                                     obs.get('odometry'), self._zoom)
             self.arrival = self.search.arrival.copy()
             return chosen
         observation = Observation(
