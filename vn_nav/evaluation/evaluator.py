@@ -127,7 +127,8 @@ class PolicyActor:
                  threshold: float = STOP_THRESHOLD, known: Sequence[str] = ()):
         self.env, self.threshold = env, threshold
         self.known = known if network.config.scenes > 1 else ()
-        self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
+        self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed,
+                                    scanner=getattr(env, 'scanner', None))
         self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
