@@ -11,6 +11,7 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, Image, LaserScan
 
 from vn_msgs_py.images import decode_depth
+from vn_msgs_py.topics import topic
 from vn_nav.bags.mapping.pose_graph import between
 from vn_nav.errors import UserError
 from vn_nav.measured_ranges import DepthCamera, Scan, laser_scan
@@ -20,7 +21,6 @@ from vn_nav.nodes.window import Window
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.robot import RobotSpec
-from vn_msgs_py.topics import topic
 
 KEPT = 4  # messages
 ALIVE_S = 1.0  # of steady time: longer silent, nobody waits for it
@@ -42,24 +42,26 @@ class RangeSource(NamedTuple):
     depth: str
     mount: tuple[float, float, float]
 
-    def check(self, searches: bool) -> None:
-        """Whether a policy can use it.
+    def __bool__(self) -> bool:
+        return bool(self.scan or self.depth)
 
-        Args:
-            searches: the policy has a map.
-
-        Raises:
-            UserError: it has none, or both topics are named.
-        """
-        given = [name for name in ('scan', 'depth') if getattr(self, name)]
-        if len(given) > 1:
+    def check(self) -> None:
+        """Raise `UserError` where both topics are named."""
+        if self.scan and self.depth:
             raise UserError('the map takes ranges from one topic',
                             f'scan_topic {self.scan}, depth_topic {self.depth}',
                             'leave one of them empty')
-        if given and not searches:
+
+    def check_policy(self, searches: bool) -> None:
+        """Raise `UserError` where a topic is named for a policy that has no map.
+
+        Args:
+            searches: it has one.
+        """
+        if self and not searches:
+            named = f'scan_topic {self.scan}' if self.scan else f'depth_topic {self.depth}'
             raise UserError('measured ranges are for policies that search with a map',
-                            f'{given[0]}_topic {getattr(self, given[0])}; this one has none',
-                            'leave it empty')
+                            f'{named}; this one has none', 'leave it empty')
 
 
 class RangeInput:
@@ -176,7 +178,7 @@ class RangeInput:
             raise UserError('camera_info has the size of the depth picture',
                             (info.width, info.height), 'check the driver of the camera')
         if not (np.isfinite(info.k).all() and info.k[0] > 0 and info.k[4] > 0):
-            raise UserError('camera_info has focal lengths', (info.k[0], info.k[4]),
+            raise UserError('camera_info has focal lengths', (float(info.k[0]), float(info.k[4])),
                             'calibrate the camera')
         # In its pixels the first centre is 0.
         camera = DepthCamera((info.k[0], info.k[4]), (info.k[2] + 0.5, info.k[5] + 0.5),

@@ -149,6 +149,13 @@ class OccupancyGrid:
         """[SIDE,SIDE] bool: hardly seen."""
         return (self.seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
 
+    def occupancy(self) -> np.ndarray:
+        """[SIDE,SIDE] int8: percent of an obstacle, -1: nothing is known."""
+        percent = np.round(100 / (1 + np.exp(-self.log_odds.astype(float)))).astype(np.int8)
+        known = (self.seen >= KNOWN) | self.measured
+        return np.where(self.contacts, 100, np.where(
+            self.stood, 0, np.where(known, percent, -1))).astype(np.int8)
+
     def uncharted(self) -> np.ndarray:
         """[SIDE,SIDE] bool: nobody knows whether something stands there."""
         return self.unknown() & ~self.measured

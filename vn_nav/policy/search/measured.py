@@ -36,7 +36,7 @@ def enter_scan(log_odds, measured, origin, cell, at, bearings, ranges, nearest, 
         far = max(found, nearest)  # minus infinity: something is nearer than that
         ends = far <= reach
         passes = 0.0 if found < nearest else min(far, reach)
-        for k in range(int(passes / step) + 1):
+        for k in range(int(passes / step) + 2):
             # The last one is where the ray ends, exactly.
             r = (k + 0.5) * step
             last = r >= passes
