@@ -128,10 +128,15 @@ class PolicyActor:
                  threshold: float = STOP_THRESHOLD, known: Sequence[str] = ()):
         self.env, self.threshold = env, threshold
         self.known = known if network.config.scenes > 1 else ()
+<<<<<<< HEAD
         self.policy = BatchedPolicy(
             network, env.num_envs, decoding=decoding, seed=seed,
             zoom=(max(zoom_of(env.robot.camera_fov, network.config.view), 1.0)
                   if network.config.architecture == SEARCH else 1.0))
+=======
+        self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed,
+                                    scanner=getattr(env, 'scanner', None))
+>>>>>>> scan
         self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:

@@ -62,7 +62,7 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
 {html.escape(str(result['world_version']))}, task
 {html.escape(result['task'])}, actions by the rule <i>{result['decoding']}</i>, at most
 {result['max_decisions']} decisions an episode, seed {result['seed']}, odometry:
-{html.escape(result['odometry'])}. vn_nav {__version__},
+{html.escape(result['odometry'])}, ranges: {html.escape(result['ranges'])}. vn_nav {__version__},
 {result['date']}.</p>
 {body}
 {DEFINITIONS}""")

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
+from vn_nav.measured_ranges import Scan
 from vn_nav.policy.search.approach import best_move
 from vn_nav.policy.search.costmap import ROOM, Costmap
 from vn_nav.policy.search.grid import OccupancyGrid
@@ -106,7 +107,7 @@ class Searcher:
         self._decisions, self._forgot, self._stuck_for = 0, -FORGET_EVERY, 0
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
-             unmoved: bool = False) -> int:
+             unmoved: bool = False, scan: Scan | None = None) -> int:
         """The next action.
 
         Args:
@@ -114,10 +115,15 @@ class Searcher:
             last_action: what was done before it; -1: nothing.
             odometry: [3] pose, if the robot has odometry; what counts is how it changes.
             unmoved: without odometry: the picture is as before the action.
+            scan: measured where the picture was taken: the map takes it in place of the ranges
+                that are seen.
         """
         self._move(last_action, odometry, unmoved)
         self.grid.add_footprint(self.pose)
-        self.grid.add_ranges(self.pose, self.bearings, sight.ranges, self.edges)
+        if scan is None or np.isnan(scan.ranges).all():
+            self.grid.add_ranges(self.pose, self.bearings, sight.ranges, self.edges)
+        else:
+            self.grid.add_scan(self.pose, scan, self.bearings)
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
         self.arrival, self.seen = sight.arrived, sight
