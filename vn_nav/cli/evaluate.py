@@ -62,6 +62,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help='that a policy which uses odometry is given: what really happened, '
                         'that with the errors of a good base, or the moves as commanded (default: '
                         'drift; none for other policies)')
+    parser.add_argument('--stop', choices=evaluator.STOPS, help='what ends the episodes: '
+                        'arriving, or that the policy says so (default: both, apart)')
     parser.add_argument('--no-controls', action='store_true')
     parser.add_argument('--per-scene', action='store_true', help='print each scene as well')
     parser.add_argument('--json', type=Path, metavar='FILE', help='also write the figures here')
@@ -76,15 +78,18 @@ def run(args: argparse.Namespace) -> int:
     config = EvaluateConfig(
         episodes=args.episodes, seed=args.seed, decoding=args.decoding,
         controls=() if args.no_controls else evaluator.CONTROLS,
-        stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None)
-    checkpoint, robot = load_for(args.checkpoint, args.robot)
+        stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None,
+        stops=(args.stop,) if args.stop else evaluator.STOPS)
+    # Pictures of a drive were taken with its own camera.
+    checkpoint, robot = load_for(args.checkpoint, args.robot, any_camera=args.bag is None)
     odometry = odometry_for(checkpoint.network, args.odometry)
     bag = args.bag.name if args.bag else None
 
     def show(name: str, result: dict) -> None:
         split = result['splits'][name]
+        camera = f', camera {result["camera"]}' if args.robot else ''
         title = (f'{args.checkpoint}, {tables.place(name, list(split["scenes"]), bag)}, '
-                 f'{args.max_decisions} decisions at most')
+                 f'{args.max_decisions} decisions at most{camera}')
         tables.print_rows(split['rows'], title)
         if args.per_scene and not args.bag:
             tables.print_scenes(split['scenes'], title)
