@@ -231,11 +231,7 @@ class DecisionWorker:
             self._runtime.reset_odometry()
         scan = None if self._ranges is None else self._ranges.scan_at(stamp)
         try:
-<<<<<<< HEAD
-            action = self._runtime.act(picture, pose, zoom)
-=======
-            action = self._runtime.act(picture, pose, scan)
->>>>>>> scan
+            action = self._runtime.act(picture, pose, scan, zoom)
         except FloatingPointError as error:
             with self._wake:
                 self._navigator.stop(str(error), time.monotonic())

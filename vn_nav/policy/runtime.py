@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from vn_nav.errors import UserError
-<<<<<<< HEAD
+from vn_nav.measured_ranges import Scan, Scanner
 from vn_nav.observation import (
     Observation,
     check_lens,
@@ -18,10 +18,6 @@ from vn_nav.observation import (
     preprocess,
     through_lens,
 )
-=======
-from vn_nav.measured_ranges import Scan, Scanner
-from vn_nav.observation import Observation
->>>>>>> scan
 from vn_nav.policy.action_filter import FilterCounts, make_filter
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
@@ -200,12 +196,8 @@ class PolicyRuntime:
         return self.stop_threshold is not None and self.arrival > self.stop_threshold
 
     @torch.inference_mode()
-<<<<<<< HEAD
-    def act(self, image: np.ndarray, odometry: np.ndarray | None = None, zoom: float = 1.0) -> int:
-=======
     def act(self, image: np.ndarray, odometry: np.ndarray | None = None,
-            scan: Scan | None = None) -> int:
->>>>>>> scan
+            scan: Scan | None = None, zoom: float = 1.0) -> int:
         """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
@@ -217,12 +209,9 @@ class PolicyRuntime:
                 the same until `reset_odometry`, `reset` or `set_goal`; what counts is how it
                 changes. None: unknown at this picture; the frame stays. Of use to a policy that
                 searches alone.
-<<<<<<< HEAD
-            zoom: of picture and goal, as `prepare` says.
-=======
             scan: ranges that were measured there, which its map takes in place of those that it
                 sees in the picture. None: there are none at this picture.
->>>>>>> scan
+            zoom: of picture and goal, as `prepare` says.
 
         Raises:
             FloatingPointError: the outputs are not finite; memory and last action stay.
@@ -235,11 +224,7 @@ class PolicyRuntime:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
         if self.search is not None:
-<<<<<<< HEAD
-            return self._search_on(picture, odometry, zoom)
-=======
-            return self._search_on(picture, odometry, scan)
->>>>>>> scan
+            return self._search_on(picture, odometry, scan, zoom)
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -261,21 +246,14 @@ class PolicyRuntime:
             self.reset()
         return action
 
-<<<<<<< HEAD
-    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, zoom: float) -> int:
-=======
-    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, scan: Scan | None
-                   ) -> int:
->>>>>>> scan
+    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, scan: Scan | None,
+                   zoom: float) -> int:
         """`act` of a policy that searches."""
         assert self.search is not None and self._goal_maps is not None
         action = int(self.search.act(
             picture.numpy(), self._goal_maps, np.array([self._last_action]),
-<<<<<<< HEAD
-            np.array([self._starts]), None if odometry is None else odometry[None], zoom)[0])
-=======
-            np.array([self._starts]), None if odometry is None else odometry[None], [scan])[0])
->>>>>>> scan
+            np.array([self._starts]), None if odometry is None else odometry[None], [scan],
+            zoom)[0])
         self.arrival = float(self.search.arrival[0])
         self._last_action, self._starts = action, False
         if self.arrived:
@@ -299,12 +277,9 @@ class BatchedPolicy:
         num_envs: environments N.
         decoding: 'sample' or 'greedy'.
         seed: of the sampled actions.
-<<<<<<< HEAD
         zoom: how many times the robots' lens magnifies against the policy's, for one that
             searches; see `vn_nav.policy.search.lens`.
-=======
         scanner: what measures the `scan` of observations, if the robots have one.
->>>>>>> scan
 
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
@@ -316,15 +291,10 @@ class BatchedPolicy:
     """
 
     def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0,
-<<<<<<< HEAD
-                 zoom: float = 1.0):
-        _check_decoding(decoding)
-        self.network, self.decoding, self._zoom = network, decoding, zoom
-=======
-                 scanner: Scanner | None = None):
+                 scanner: Scanner | None = None, zoom: float = 1.0):
         _check_decoding(decoding)
         self.network, self.decoding, self.scanner = network, decoding, scanner
->>>>>>> scan
+        self._zoom = zoom
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self.logits: torch.Tensor | None = None
@@ -376,11 +346,7 @@ class BatchedPolicy:
             scans = None if self.scanner is None else [
                 Scan(self.scanner, ranges) for ranges in obs['scan']]
             chosen = self.search.act(obs['image'], maps, last_action, reset_mask,
-<<<<<<< HEAD
-                                     obs.get('odometry'), self._zoom)
-=======
-                                     obs.get('odometry'), scans)
->>>>>>> scan
+                                     obs.get('odometry'), scans, self._zoom)
             self.arrival = self.search.arrival.copy()
             return chosen
         observation = Observation(

@@ -130,6 +130,7 @@ def _dijkstra(price, cells, costs, row0, column0):
 
 @numba.njit(cache=True)
 def free_length(passable, clearance, origin, x, y, angle, length):
+    """`Costmap.free_length`, for other kernels."""
     side = passable.shape[0]
     dx, dy = math.cos(angle), math.sin(angle)
     count = max(int(math.ceil(length / (0.5 * CELL))), 1)

@@ -51,12 +51,8 @@ class SearchDriver:
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
-<<<<<<< HEAD
-            starts: np.ndarray, odometry: np.ndarray | None, zoom: float = 1.0) -> np.ndarray:
-=======
             starts: np.ndarray, odometry: np.ndarray | None,
-            scans: Sequence[Scan | None] | None = None) -> np.ndarray:
->>>>>>> scan
+            scans: Sequence[Scan | None] | None = None, zoom: float = 1.0) -> np.ndarray:
         """Actions [N] int64.
 
         Args:
@@ -65,11 +61,8 @@ class SearchDriver:
             last_action: [N], -1: none.
             starts: [N] bool, where an episode begins: map and hypotheses are empty.
             odometry: [N,3] x, y [m], yaw [rad]; None: nobody has any.
-<<<<<<< HEAD
             zoom: how many times the lens of pictures and goals magnifies, see `lens`.
-=======
             scans: [N] measured ranges; None: of nobody, or not of this robot at this picture.
->>>>>>> scan
 
         Raises:
             FloatingPointError: what the networks say is not finite.

@@ -167,7 +167,7 @@ class Searcher:
             action = self._follow(own, costmap, here)
             if action is not None:
                 return action
-        # Where nothing is left to see, or the robot is stuck, obstacles may be none: it goes closer.
+        # Where nothing is left to see, or the robot is stuck, it passes obstacles closer.
         self._watch()
         if not self._stuck_for:
             action = self._explore(costmap, here)
