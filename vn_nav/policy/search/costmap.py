@@ -10,8 +10,10 @@ import numba
 import numpy as np
 
 from vn_nav.policy.search.grid import CELL, OccupancyGrid
+from vn_nav.policy.search.measured import free_of_points
 
 KEEP = 0.04  # m beyond the footprint that is passable: a cell's edge is half a cell off
+SCAN_KEEP = 0.015  # m, the same of what a scan shows exactly
 KEEP_OFF = 0.2  # m beyond the footprint within which a way costs more
 CLOSE_COST = 2.0  # of it: this many metres more for a metre, at the footprint
 UNKNOWN_COST = 2.0  # the same for floor that nobody has seen or measured
@@ -80,8 +82,14 @@ class Costmap:
         Args:
             pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
         """
-        return _free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
-                            float(pose[1]), angle, length)
+        got, clear = _free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
+                                  float(pose[1]), angle, length)
+        if self.grid.points is None:
+            return got, clear
+        # A scan is finer than cells.
+        exact, room = free_of_points(self.grid.points, float(pose[0]), float(pose[1]), angle,
+                                     length, self.grid.footprint + SCAN_KEEP)
+        return min(got, exact), min(clear, room)
 
 
 @numba.njit(cache=True)
