@@ -377,7 +377,7 @@ def test_a_scan_says_exactly_how_far_a_straight_line_is_free():
     grid.log_odds[grid.obstacles()] = 0.0  # by the map all is free
     costmap = Costmap(grid)
     got, clear = costmap.free_length(pose, 0.0, 0.5)
-    assert got == pytest.approx(0.601 - 0.195, abs=1e-3) and clear == pytest.approx(0.195, abs=1e-3)
+    assert (got, clear) == pytest.approx((0.601 - 0.195, 0.195), abs=1e-3)
     assert costmap.free_length(pose, 0.0, 0.3)[0] == 0.3
     grid.add_ranges(pose, BEARINGS, one_hot(np.full(COLUMNS, 6.0)), RANGE_EDGES)
     assert grid.points is None  # what a scan has shown exactly is of its picture alone
