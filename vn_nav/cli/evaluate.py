@@ -66,6 +66,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help='that the map of a policy which searches is given: what its network '
                         'sees in the picture, a laser scan all around, or a depth picture '
                         '(default: picture)')
+    parser.add_argument('--stop', choices=evaluator.STOPS, help='what ends the episodes: '
+                        'arriving, or that the policy says so (default: both, apart)')
     parser.add_argument('--no-controls', action='store_true')
     parser.add_argument('--per-scene', action='store_true', help='print each scene as well')
     parser.add_argument('--json', type=Path, metavar='FILE', help='also write the figures here')
@@ -80,8 +82,10 @@ def run(args: argparse.Namespace) -> int:
     config = EvaluateConfig(
         episodes=args.episodes, seed=args.seed, decoding=args.decoding,
         controls=() if args.no_controls else evaluator.CONTROLS,
-        stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None)
-    checkpoint, robot = load_for(args.checkpoint, args.robot)
+        stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None,
+        stops=(args.stop,) if args.stop else evaluator.STOPS)
+    # Pictures of a drive were taken with its own camera.
+    checkpoint, robot = load_for(args.checkpoint, args.robot, any_camera=args.bag is None)
     odometry = odometry_for(checkpoint.network, args.odometry)
     ranges = ranges_for(checkpoint.network, args.ranges)
     measured_by = '' if ranges == 'picture' else f', ranges: {ranges}'
@@ -89,8 +93,9 @@ def run(args: argparse.Namespace) -> int:
 
     def show(name: str, result: dict) -> None:
         split = result['splits'][name]
+        camera = f', camera {result["camera"]}' if args.robot else ''
         title = (f'{args.checkpoint}, {tables.place(name, list(split["scenes"]), bag)}, '
-                 f'{args.max_decisions} decisions at most{measured_by}')
+                 f'{args.max_decisions} decisions at most{camera}{measured_by}')
         tables.print_rows(split['rows'], title)
         if args.per_scene and not args.bag:
             tables.print_scenes(split['scenes'], title)

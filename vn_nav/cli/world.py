@@ -111,8 +111,14 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
             odometry.
     """
     from vn_nav.evaluation.measurement import odometry_for, ranges_for
+    from vn_nav.observation import needed_side
+    from vn_nav.robot import load_robot
     info = checkpoint.info
-    env = make_env(scenes, envs, robot=robot, size=checkpoint.config.size,
+    size = checkpoint.config.size
+    if robot is not None:  # which may have another camera: see `PolicyActor`
+        size = needed_side(size, load_robot(robot).camera_fov,
+                           math.radians(info['camera_fov_deg']))
+    env = make_env(scenes, envs, robot=robot, size=size,
                    randomisation=randomisation or info['randomisation'], task=info['task'],
                    objects=info['objects'], actions=checkpoint.config.actions,
                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
@@ -157,8 +163,13 @@ def machine(device: str = 'cpu') -> str:
     return f'{model}, {os.cpu_count()} cores'
 
 
-def load_for(path: Path, robot: Path | None = None):
+def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False):
     """A checkpoint, and the robot with its actions.
+
+    Args:
+        path: of the checkpoint.
+        robot: file of the robot; None: the one that it was trained for.
+        any_camera: a robot file may have another camera than the policy was trained with.
 
     Raises:
         UserError: the robot has other actions or another camera.
@@ -171,7 +182,8 @@ def load_for(path: Path, robot: Path | None = None):
     spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
     present = math.degrees(spec.camera_fov), spec.camera_height
-    if any(abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
+    if not (any_camera and robot) and any(
+            abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
         raise UserError('the robot has the camera that the policy was trained with: '
                         f'{trained[0]:g} deg, {trained[1]:g} m high',
                         f'{present[0]:g} deg, {present[1]:g} m (robot {spec.name})',

@@ -20,7 +20,7 @@ from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.range_input import RangeInput
 from vn_nav.nodes.window import Window
-from vn_nav.observation import crop_fraction, needed_side, preprocess
+from vn_nav.observation import needed_side
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
@@ -55,7 +55,7 @@ class DecisionWorker:
         ranges: measured ranges for the map; None: it takes those that are seen in the pictures.
 
     Attributes:
-        camera_fov: field of view of the camera [rad], as far as it is known.
+        camera_fov: field of view of the camera's shorter side [rad], as far as it is known.
         inferences: seconds that the decisions of the last while took.
         publishers: what `create_publisher` made.
     """
@@ -72,6 +72,7 @@ class DecisionWorker:
         self._executed: Executed | None = None
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
         self.camera_fov: float | None = None
+        self._camera_aspect = 1.0  # width of its pictures over their height
         self._frame: tuple | None = None  # the newest message, its stamp, when it came
         self._goal: Image | None = None  # to be taken
         self._goal_in_force: Image | None = None
@@ -123,14 +124,20 @@ class DecisionWorker:
                 self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
 
-    def set_camera_fov(self, fov: float) -> None:
-        """What the camera says of itself [rad]. The goal was cropped for what it said before."""
+    def set_camera_fov(self, fov: float, aspect: float = 1.0) -> None:
+        """What the camera says of itself. The goal was cropped for what it said before.
+
+        Args:
+            fov: field of view of the pictures' shorter side [rad].
+            aspect: their width over their height.
+        """
         with self._wake:
-            known = self.camera_fov is not None and math.isclose(fov, self.camera_fov,
-                                                                 rel_tol=1e-3)
+            known = self.camera_fov is not None and math.isclose(
+                fov, self.camera_fov, rel_tol=1e-3) and math.isclose(
+                    aspect, self._camera_aspect, rel_tol=1e-3)
             if known:
                 return
-            self.camera_fov = fov
+            self.camera_fov, self._camera_aspect = fov, aspect
             if self._goal is None and self._goal_in_force is not None:
                 self._goal = self._goal_in_force
                 self._wake.notify_all()
@@ -146,7 +153,7 @@ class DecisionWorker:
     def check_fov(self) -> None:
         """Raise UserError where the camera sees less than the policy needs."""
         if self.camera_fov is not None:
-            crop_fraction(self.camera_fov, self._runtime.camera_fov)
+            self._runtime.check_camera(self.camera_fov, self._camera_aspect)
 
     def publish_arrival(self, *, again: bool = False) -> None:
         """Publish whether the robot stands where the policy has arrived, when that changed.
@@ -178,10 +185,10 @@ class DecisionWorker:
         with self._wake:
             self._goal_in_force = message
         # A goal picture comes from a camera like this one; it is cropped the same way.
-        picture = prepared(self._prepare, message, self._wake, self._refuse_goal)
-        if picture is None:
+        found = prepared(self._prepare, message, self._wake, self._refuse_goal)
+        if found is None:
             return
-        self._runtime.set_goal(picture)
+        self._runtime.set_goal(found[0])
         with self._wake:
             if self._goal is None:  # else a newer one is waiting
                 stamp = message.header.stamp
@@ -194,10 +201,11 @@ class DecisionWorker:
         self._navigator.refuse_goal(why)
 
     def _take_frame(self, message, stamp: float, received: float) -> None:
-        picture = prepared(self._prepare, message, self._wake,
-                           lambda why: self._navigator.bad_frame(why, time.monotonic()))
-        if picture is None:
+        found = prepared(self._prepare, message, self._wake,
+                         lambda why: self._navigator.bad_frame(why, time.monotonic()))
+        if found is None:
             return
+        picture, zoom = found
         with self._wake:
             now = time.monotonic()
             self._navigator.good_frame(received)
@@ -223,7 +231,7 @@ class DecisionWorker:
             self._runtime.reset_odometry()
         scan = None if self._ranges is None else self._ranges.scan_at(stamp)
         try:
-            action = self._runtime.act(picture, pose, scan)
+            action = self._runtime.act(picture, pose, scan, zoom)
         except FloatingPointError as error:
             with self._wake:
                 self._navigator.stop(str(error), time.monotonic())
@@ -268,8 +276,7 @@ class DecisionWorker:
         self._waits_from = None
         return True
 
-    def _prepare(self, message) -> np.ndarray:
-        fov = {} if self.camera_fov is None else {
-            'fov': self.camera_fov, 'target_fov': self._runtime.camera_fov}
-        smallest = needed_side(self._runtime.size, **fov)
-        return preprocess(images.decode_rgb(message, smallest), self._runtime.size, **fov)
+    def _prepare(self, message) -> tuple[np.ndarray, float]:
+        fov = self.camera_fov
+        smallest = needed_side(self._runtime.size, fov, self._runtime.camera_fov)
+        return self._runtime.prepare(images.decode_rgb(message, smallest), fov)

@@ -132,7 +132,7 @@ class PolicyInputs:
                 f'a camera sees {least:.0f} to {most:.0f} deg; camera_info says '
                 f'{math.degrees(fov):.3g}: calibrate the camera', throttle_duration_sec=10.0)
             return
-        self._worker.set_camera_fov(fov)
+        self._worker.set_camera_fov(fov, message.width / message.height)
 
     # What is missing or wrong with them.
 

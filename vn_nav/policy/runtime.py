@@ -10,7 +10,14 @@ import torch
 
 from vn_nav.errors import UserError
 from vn_nav.measured_ranges import Scan, Scanner
-from vn_nav.observation import Observation
+from vn_nav.observation import (
+    Observation,
+    check_lens,
+    crop_fraction,
+    fov_across,
+    preprocess,
+    through_lens,
+)
 from vn_nav.policy.action_filter import FilterCounts, make_filter
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
@@ -124,6 +131,37 @@ class PolicyRuntime:
         self.arrival = math.nan
         self.reset()
 
+    def check_camera(self, fov: float, aspect: float) -> None:
+        """Whether this policy can drive by a camera.
+
+        Args:
+            fov: of the picture's shorter side [rad]; aspect: its width over its height.
+
+        Raises:
+            UserError: it sees too little or, for a policy that searches, too much.
+        """
+        if self.search is None:
+            crop_fraction(fov, self.camera_fov)
+        else:
+            check_lens(fov_across(fov, aspect))
+
+    def prepare(self, picture: np.ndarray, fov: float | None = None, zoom: float | None = None
+                ) -> tuple[np.ndarray, float]:
+        """A camera's picture as `act` and `set_goal` take it, and the `zoom` for `act`.
+
+        Args:
+            picture: [H,W,3] uint8 RGB.
+            fov: of its shorter side [rad]; None: unknown, and taken for the policy's own.
+            zoom: that it has to have, for a goal picture of another camera than the robot's;
+                None: what the camera gives.
+
+        Raises:
+            UserError: see `vn_nav.observation.preprocess` and `through_lens`.
+        """
+        if self.search is None or fov is None:
+            return preprocess(picture, self.size, fov=fov, target_fov=self.camera_fov), 1.0
+        return through_lens(picture, self.size, fov=fov, target_fov=self.camera_fov, zoom=zoom)
+
     def reset(self) -> None:
         """Begin an episode: empty memory, no last action."""
         if self.search is None:
@@ -159,7 +197,7 @@ class PolicyRuntime:
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, odometry: np.ndarray | None = None,
-            scan: Scan | None = None) -> int:
+            scan: Scan | None = None, zoom: float = 1.0) -> int:
         """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
@@ -173,6 +211,7 @@ class PolicyRuntime:
                 searches alone.
             scan: ranges that were measured there, which its map takes in place of those that it
                 sees in the picture. None: there are none at this picture.
+            zoom: of picture and goal, as `prepare` says.
 
         Raises:
             FloatingPointError: the outputs are not finite; memory and last action stay.
@@ -185,7 +224,7 @@ class PolicyRuntime:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
         if self.search is not None:
-            return self._search_on(picture, odometry, scan)
+            return self._search_on(picture, odometry, scan, zoom)
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -207,13 +246,14 @@ class PolicyRuntime:
             self.reset()
         return action
 
-    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, scan: Scan | None
-                   ) -> int:
+    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, scan: Scan | None,
+                   zoom: float) -> int:
         """`act` of a policy that searches."""
         assert self.search is not None and self._goal_maps is not None
         action = int(self.search.act(
             picture.numpy(), self._goal_maps, np.array([self._last_action]),
-            np.array([self._starts]), None if odometry is None else odometry[None], [scan])[0])
+            np.array([self._starts]), None if odometry is None else odometry[None], [scan],
+            zoom)[0])
         self.arrival = float(self.search.arrival[0])
         self._last_action, self._starts = action, False
         if self.arrived:
@@ -237,6 +277,8 @@ class BatchedPolicy:
         num_envs: environments N.
         decoding: 'sample' or 'greedy'.
         seed: of the sampled actions.
+        zoom: how many times the robots' lens magnifies against the policy's, for one that
+            searches; see `vn_nav.policy.search.lens`.
         scanner: what measures the `scan` of observations, if the robots have one.
 
     Attributes:
@@ -249,9 +291,10 @@ class BatchedPolicy:
     """
 
     def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0,
-                 scanner: Scanner | None = None):
+                 scanner: Scanner | None = None, zoom: float = 1.0):
         _check_decoding(decoding)
         self.network, self.decoding, self.scanner = network, decoding, scanner
+        self._zoom = zoom
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self.logits: torch.Tensor | None = None
@@ -303,7 +346,7 @@ class BatchedPolicy:
             scans = None if self.scanner is None else [
                 Scan(self.scanner, ranges) for ranges in obs['scan']]
             chosen = self.search.act(obs['image'], maps, last_action, reset_mask,
-                                     obs.get('odometry'), scans)
+                                     obs.get('odometry'), scans, self._zoom)
             self.arrival = self.search.arrival.copy()
             return chosen
         observation = Observation(

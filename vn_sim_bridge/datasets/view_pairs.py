@@ -168,7 +168,9 @@ class PairSampler:
         if self._lenses is not None:
             fovs, shares, masts = self._lenses.draw(self._seed, numbers[::size], self.robot)
             off = (np.repeat(fovs - self.robot.camera_fov, size),
-                   np.repeat(masts - self.robot.camera_height, size))
+                   np.repeat(masts - self.robot.camera_height, size),
+                   self._lenses.pitches(self._seed, np.repeat(numbers[::size], size),
+                                        np.tile(np.arange(size), count)))
             zoom = np.repeat([zoom_of(own, self.robot.camera_fov) for own in fovs], size)
             aspects = np.repeat(shares, size)
         frames, (cameras, fov) = self._look(np.repeat(place[::robots], size), poses, numbers,
@@ -263,15 +265,16 @@ class PairSampler:
         return tasks.arrived(distance, error)
 
     def _look(self, place, poses, numbers, view: int | np.ndarray,
-              off: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Frames, tuple]:
+              off: tuple[np.ndarray, ...] | None = None) -> tuple[Frames, tuple]:
         """Pictures from poses, and the cameras that took them; `view` tells the two apart.
 
-        `off` is added to their fields of view [rad] and heights [m].
+        `off` is added to their fields of view [rad], heights [m] and pitches [rad].
         """
         appearance = self.simulator.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
         if off is not None:
             appearance = appearance._replace(fov=appearance.fov + off[0],
-                                             height=appearance.height + off[1])
+                                             height=appearance.height + off[1],
+                                             pitch=appearance.pitch + off[2])
         frames = self.simulator.view(place, poses, None, appearance,
                                      key(self._seed, Stream.PAIR_SENSOR, numbers, view))
         return frames, self.simulator.cameras(poses, appearance)

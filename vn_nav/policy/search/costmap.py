@@ -30,6 +30,7 @@ class Costmap:
     Args:
         grid: the map.
         off: m by which obstacles are passed closer than the footprint, where all else failed.
+        felt: what the robot has touched counts as well.
 
     Attributes:
         clearance: [SIDE,SIDE] m to the nearest obstacle.
@@ -39,9 +40,11 @@ class Costmap:
         cost: [SIDE,SIDE] float32 of a metre; 0 where it is not passable.
     """
 
-    def __init__(self, grid: OccupancyGrid, off: float = 0.0):
+    def __init__(self, grid: OccupancyGrid, off: float = 0.0, felt: bool = True):
         self.grid = grid
         obstacles = grid.obstacles()
+        if not felt:
+            obstacles &= ~grid.contacts
         self.clearance = CELL * cv2.distanceTransform(
             (~obstacles).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         limit = grid.footprint + (KEEP if off == 0 else -off)
@@ -82,14 +85,22 @@ class Costmap:
         Args:
             pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
         """
-        got, clear = _free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
-                                  float(pose[1]), angle, length)
-        if self.grid.points is None:
-            return got, clear
-        # A scan is finer than cells.
-        exact, room = free_of_points(self.grid.points, float(pose[0]), float(pose[1]), angle,
-                                     length, self.grid.footprint + SCAN_KEEP)
+        got, clear = free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
+                                 float(pose[1]), angle, length)
+        exact, room = self.scanned_length(pose, angle, length)
         return min(got, exact), min(clear, room)
+
+    def scanned_length(self, pose: np.ndarray, angle: float, length: float
+                       ) -> tuple[float, float]:
+        """As `free_length`, by the newest scan alone, which is finer than cells.
+
+        Returns:
+            The whole length and infinity where a picture came since.
+        """
+        if self.grid.points is None:
+            return length, math.inf
+        return free_of_points(self.grid.points, float(pose[0]), float(pose[1]), angle, length,
+                              self.grid.footprint + SCAN_KEEP)
 
 
 @numba.njit(cache=True)
@@ -134,7 +145,8 @@ def _dijkstra(price, cells, costs, row0, column0):
 
 
 @numba.njit(cache=True)
-def _free_length(passable, clearance, origin, x, y, angle, length):
+def free_length(passable, clearance, origin, x, y, angle, length):
+    """`Costmap.free_length`, for other kernels."""
     side = passable.shape[0]
     dx, dy = math.cos(angle), math.sin(angle)
     count = max(int(math.ceil(length / (0.5 * CELL))), 1)
