@@ -90,6 +90,7 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
 def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
                  max_decisions: int = 300, goal_seed: int = 0, odometry: str | None = None,
+                 size: int | None = None,
                  say: Callable[[str], None] = SAY):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
 
@@ -102,6 +103,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         max_decisions: of an episode.
         goal_seed: 0 for the goals of the training.
         odometry: that the policy is given; None: see `measurement.odometry_for`.
+        size: side of the pictures [pixels]; None: what the policy needs.
         say: receives a line about what the simulator cannot vary.
 
     Raises:
@@ -112,10 +114,11 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
     from vn_nav.observation import needed_side
     from vn_nav.robot import load_robot
     info = checkpoint.info
-    size = checkpoint.config.size
-    if robot is not None:  # which may have another camera: see `PolicyActor`
-        size = needed_side(size, load_robot(robot).camera_fov,
-                           math.radians(info['camera_fov_deg']))
+    if size is None:
+        size = checkpoint.config.size
+        if robot is not None:  # which may have another camera: see `PolicyActor`
+            size = needed_side(size, load_robot(robot).camera_fov,
+                               math.radians(info['camera_fov_deg']))
     env = make_env(scenes, envs, robot=robot, size=size,
                    randomisation=randomisation or info['randomisation'], task=info['task'],
                    objects=info['objects'], actions=checkpoint.config.actions,

@@ -22,7 +22,7 @@ class Guess(NamedTuple):
 class Snapshot(NamedTuple):
     """A search at a moment, in the frame of its map."""
 
-    cells: np.ndarray  # [R,C] int8 of `UNKNOWN`, `FREE`, `OCCUPIED`, rows along y
+    cells: np.ndarray  # [R,C] int8, `FREE` to `OCCUPIED` in percent, or `UNKNOWN`; rows along y
     origin: np.ndarray  # [2] m, of the lower left corner of the first cell
     cell: float  # m
     pose: np.ndarray  # [3] x, y [m], yaw [rad] of the robot
@@ -36,13 +36,24 @@ def snapshot(searcher: Searcher) -> Snapshot:
     grid = searcher.grid
     obstacles = grid.obstacles()
     known = (grid.seen >= KNOWN) | grid.stood | obstacles
-    cells = np.where(obstacles, OCCUPIED, np.where(known, FREE, UNKNOWN)).astype(np.int8)
-    rows, columns = (_range(known.any(axis)) for axis in (1, 0))
+    cells, origin = cut_to_known(np.where(obstacles, OCCUPIED, np.where(
+        known, FREE, UNKNOWN)).astype(np.int8), grid.origin, CELL)
     guesses = sorted(searcher.hypotheses.all, key=lambda own: -own.weight)
     return Snapshot(
-        cells[rows, columns].copy(), grid.origin + CELL * np.array([columns.start, rows.start]),
-        CELL, searcher.pose.copy(), tuple(Guess(own.pose.copy(), own.weight) for own in guesses),
-        searcher.aim, float(searcher.arrival))
+        cells, origin, CELL, searcher.pose.copy(),
+        tuple(Guess(own.pose.copy(), own.weight) for own in guesses), searcher.aim,
+        float(searcher.arrival))
+
+
+def cut_to_known(cells: np.ndarray, origin: np.ndarray, cell: float
+                 ) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a map that is known, a copy, and its origin [2] m.
+
+    Args:
+        cells: [R,C] as of `Snapshot`; origin: [2] m of theirs; cell: m.
+    """
+    rows, columns = (_range((cells != UNKNOWN).any(axis)) for axis in (1, 0))
+    return cells[rows, columns].copy(), origin + cell * np.array([columns.start, rows.start])
 
 
 def _range(known: np.ndarray) -> slice:
