@@ -91,6 +91,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
                  max_decisions: int = 300, goal_seed: int = 0, odometry: str | None = None,
                  size: int | None = None,
+                 ranges: str | None = None,
                  say: Callable[[str], None] = SAY):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
 
@@ -104,13 +105,14 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         goal_seed: 0 for the goals of the training.
         odometry: that the policy is given; None: see `measurement.odometry_for`.
         size: side of the pictures [pixels]; None: what the policy needs.
+        ranges: that its map is given; None: see `measurement.ranges_for`.
         say: receives a line about what the simulator cannot vary.
 
     Raises:
         UserError: the checkpoint belongs to another version of the simulator; the policy uses no
             odometry.
     """
-    from vn_nav.evaluation.measurement import odometry_for
+    from vn_nav.evaluation.measurement import odometry_for, ranges_for
     from vn_nav.observation import needed_side
     from vn_nav.robot import load_robot
     info = checkpoint.info
@@ -125,6 +127,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
                    goals_per_room=info['goals_per_room'] if own else 1,
                    odometry=odometry_for(checkpoint.network, odometry),
+                   ranges=ranges_for(checkpoint.network, ranges),
                    may_lack=() if randomisation else ('randomisation',), say=say)
     try:
         check_version(info, simulator=env.simulator_name, version=env.world_version)

@@ -13,6 +13,7 @@ from vn_nav.observation import preprocess
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.policy.search.lens import zoom_of
 from vn_nav.policy.search.snapshot import Snapshot, snapshot
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
@@ -148,7 +149,11 @@ class PolicyActor:
         self._size, self._camera_fov = network.config.size, camera_fov
         self._goals: tuple[np.ndarray, np.ndarray] | None = None  # the robots', and the network's
         self.known = known if network.config.scenes > 1 else ()
-        self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
+        self.policy = BatchedPolicy(
+            network, env.num_envs, decoding=decoding, seed=seed,
+            scanner=getattr(env, 'scanner', None),
+            zoom=(max(zoom_of(env.robot.camera_fov, network.config.view), 1.0)
+                  if network.config.architecture == SEARCH else 1.0))
         self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from vn_nav.evaluation import evaluator
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
 from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import SEARCH
 from vn_nav.robot import RobotSpec
 
 
@@ -70,7 +71,8 @@ class Evaluation:
 
 
 def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions: int,
-               decoding: str, seed: int, odometry: str, camera: str | None = None) -> dict:
+               decoding: str, seed: int, odometry: str, ranges: str = 'picture',
+               camera: str | None = None) -> dict:
     """A result without splits: what all of them have in common.
 
     Args:
@@ -82,6 +84,7 @@ def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions
         decoding: 'sample' or 'greedy'.
         seed: of the episodes.
         odometry: that the policy was given: true, drift, commanded, or none.
+        ranges: that its map was given: picture, scan or depth.
         camera: of the robots, in words; None: the one that the policy was trained with.
     """
     return {'checkpoint': checkpoint,
@@ -89,7 +92,7 @@ def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions
             'bag': bag, 'simulator': info['simulator'],
             'world_version': info['world_version'], 'task': info['task'],
             'decoding': decoding, 'max_decisions': max_decisions, 'seed': seed,
-            'odometry': odometry, 'camera': camera or camera_name(
+            'odometry': odometry, 'ranges': ranges, 'camera': camera or camera_name(
                 info['camera_fov_deg'], info['camera_height']),
             'date': datetime.date.today().isoformat(), 'splits': {}}
 
@@ -113,6 +116,22 @@ def odometry_for(network: Policy, wanted: str | None = None) -> str:
         raise UserError('odometry is for policies that use it', f'{wanted}; this one uses none',
                         'leave it out (--odometry)')
     return wanted or ('drift' if network.uses_odometry else 'none')
+
+
+def ranges_for(network: Policy, wanted: str | None = None) -> str:
+    """The ranges that the map of a policy is measured with: picture, scan or depth.
+
+    Args:
+        network: the policy.
+        wanted: by the user; None: picture, what the network sees itself.
+
+    Raises:
+        UserError: the policy has no map.
+    """
+    if wanted not in (None, 'picture') and network.config.architecture != SEARCH:
+        raise UserError('measured ranges are for policies that search with a map',
+                        f'{wanted}; this one has none', 'leave it out (--ranges)')
+    return wanted or 'picture'
 
 
 def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make_env: Callable,
@@ -193,6 +212,7 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
         done.result = done.result or new_result(
             {**checkpoint.info, **world}, checkpoint=name, bag=bag,
             max_decisions=configs[0].max_decisions, odometry=configs[0].odometry,
+            ranges=configs[0].ranges,
             camera=cameras[0],
             decoding=config.decoding or checkpoint.info['decoding'], seed=config.seed)
         done.result['splits'][split] = evaluator.split_figures(measured, scenes)

@@ -76,7 +76,8 @@ def evaluation_page(result: dict, measured: dict[str, Rows],
 {html.escape(str(result['world_version']))}, task
 {html.escape(result['task'])}, actions by the rule <i>{result['decoding']}</i>, at most
 {result['max_decisions']} decisions an episode, seed {result['seed']}, odometry:
-{html.escape(result['odometry'])}, camera: {html.escape(result['camera'])}. vn_nav {__version__},
+{html.escape(result['odometry'])}, ranges: {html.escape(result['ranges'])},
+camera: {html.escape(result['camera'])}. vn_nav {__version__},
 {result['date']}.</p>
 {body}
 {DEFINITIONS}""")

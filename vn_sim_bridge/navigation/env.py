@@ -27,6 +27,7 @@ from vn_sim_bridge.navigation.env_config import (
     with_own_actions,
 )
 from vn_sim_bridge.navigation.episode_odometry import EpisodeOdometry
+from vn_sim_bridge.navigation.episode_ranges import EpisodeRanges
 from vn_sim_bridge.navigation.episodes import draw_motion_scale, draw_variant
 from vn_sim_bridge.navigation.exploration import Exploration
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
@@ -53,6 +54,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     With `config.odometry` there is also `odometry` [N,3] float64: x, y [m], yaw [rad] as the
     robots' own odometry has them, in a frame of its own that begins at (0, 0, 0) with every
     episode: x ahead of where the robot starts, y to its left (see `EpisodeOdometry`).
+
+    With `config.ranges` other than `picture` there is also `scan` [N,K] float32 m: ranges along
+    the bearings of the attribute `scanner`, measured where the pictures are taken (see
+    `EpisodeRanges`). They are for the map of a policy that has one; no network is shown them.
 
     With `stop='declared'` arriving ends no episode. `step` then takes one more number,
     `declare_action`, which says "I have arrived": the robot stays where it is and the episode
@@ -107,6 +112,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
         self._base = BaseMotion(config, self.robot, exact_turns=self.simulator.exact_turns)
         self._odometry = None if config.odometry == 'none' else EpisodeOdometry(config.odometry, n)
+        self._ranges = None if config.ranges == 'picture' else EpisodeRanges(
+            config.ranges, self.simulator, self.robot, config.size)
+        self.scanner = None if self._ranges is None else self._ranges.scanner
         self._views = GoalViews(
             self.simulator, self.task.views, variants=config.pictures_per_goal, size=config.size,
             seed=config.seed,
@@ -178,6 +186,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             **features,
             **({} if self._odometry is None else {
                 'odometry': spaces.Box(-np.inf, np.inf, (3,), np.float64)}),
+            **({} if self.scanner is None else {
+                'scan': spaces.Box(-np.inf, np.inf, (len(self.scanner.bearings),), np.float32)}),
         })
         self.single_action_space = spaces.Discrete(self._choices)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -467,6 +477,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                                                               self.simulator.poses)
         if self._odometry is not None:
             observation['odometry'] = self._odometry.poses.copy()
+        if self._ranges is not None:
+            observation['scan'] = self._ranges.measure(
+                frames, self._counters(np.arange(self.num_envs)), self._step)
         other, at_shown = self._views.other_shown(self._shown_goal, self._goal, self.place_index,
                                                   self.simulator.poses)
         self._seen_now = frames.depth, reset
