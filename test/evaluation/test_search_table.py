@@ -25,8 +25,9 @@ def call(table, monkeypatch, capsys, *words):
 
 
 def test_every_row_of_the_issue_is_there(table):
-    assert {'wrong', 'absent', 'blank', 'random', 'explorer', 'shortest', 'rough', 'true', 'none',
-            'low', 'high', 'narrow', 'wide', 'test', 'unseen_look'} <= table.ROWS.keys()
+    assert {'test', 'unseen_look', 'wrong', 'absent', 'blank', 'random', 'explorer', 'shortest',
+            'rough', 'true', 'none', 'scan', 'depth', 'low', 'high', 'narrow',
+            'wide'} <= table.ROWS.keys()
     for row in table.ROWS.values():
         assert row.robot is None or (table.ROBOTS / f'{row.robot}.yaml').is_file()
 
@@ -35,7 +36,7 @@ def test_rows_are_measured_once_and_kept(table, monkeypatch, capsys, tmp_path):
     folder = write_small_search(tmp_path / 'model')
     common = (folder, '--houses', 2, '--episodes', 2, '--max-decisions', 3, '--out',
               tmp_path / 'rows')
-    rows = ('absent', 'random', 'low', 'wide')
+    rows = ('absent', 'random', 'low', 'narrow', 'wide')
     code, first = call(table, monkeypatch, capsys, *common, '--rows', *rows)
     assert code == 0
     lines = [line for line in first.out.splitlines() if line.startswith('|')]
@@ -48,7 +49,7 @@ def test_rows_are_measured_once_and_kept(table, monkeypatch, capsys, tmp_path):
     assert low['conditions']['camera'] == 'low' and low['figures'].keys() == {'declared'}
     assert json.loads(kept['random'])['figures'].keys() == {'arrival', 'declared'}
 
-    monkeypatch.setattr(table, 'measure', lambda *_: pytest.fail('measured again'))
+    monkeypatch.setattr(table, 'measured', lambda *_: pytest.fail('measured again'))
     code, again = call(table, monkeypatch, capsys, *common, '--rows', *rows)
     assert code == 0 and again.out.splitlines() == lines
     assert kept == {path.stem: path.read_bytes() for path in (tmp_path / 'rows').iterdir()}
@@ -63,7 +64,7 @@ def test_what_cannot_be_measured_is_said_and_the_rest_goes_on(table, monkeypatch
 
     def refuse(row, *_):
         raise table.UserError('a rule', row.title, 'a remedy')
-    monkeypatch.setattr(table, 'measure', refuse)
+    monkeypatch.setattr(table, 'measured', refuse)
     code, done = call(table, monkeypatch, capsys, folder, '--out', tmp_path / 'rows', '--rows',
                       'low', 'wide')
     assert code == 1 and done.err.count('a rule') == 2

@@ -9,12 +9,15 @@ from PIL import Image
 from small_search import ROBOT, small_search
 
 from vn_nav.errors import UserError
+from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
+from vn_nav.evaluation.bag_searches import PlacedSearch
 from vn_nav.evaluation.evaluator import PolicyActor
 from vn_nav.evaluation.filming import film_episode
-from vn_nav.evaluation.metrics import Episode
+from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_CENTRES, RANGE_EDGES, column_bearings
 from vn_nav.policy.search.searcher import Searcher, Sight
 from vn_nav.policy.search.snapshot import FREE, OCCUPIED, UNKNOWN, Guess, Snapshot, snapshot
+from vn_nav.report.demo_page import write_report
 from vn_nav.report.evaluation_page import search_map
 from vn_nav.report.film import MOST_FRAMES, WIDTH, frames, gif
 from vn_nav.report.search_map import (
@@ -166,10 +169,34 @@ def test_only_a_search_is_filmed_and_one_at_a_time():
         filmed(count=2)
 
 
+PLAN = {'bounds': [0, 0, 6, 3], 'walls': [[0, 0, 6, 0.1]], 'obstacles': [[1, 1, 2, 2, 'bed']],
+        'rooms_list': []}
+EPISODE = Episode(
+    success=True, start_distance=3.0, path_length=3.0, decisions=2, collisions=0, seconds=9.0,
+    stop_distance=0.1, stop_heading=0.1, trajectory=np.array([[1.0, 1, 0], [1.5, 1, 0]]),
+    goal_pose=(3.0, 1.0, 0.0), search=one_wall())
+
+
 def test_a_page_shows_the_map_at_the_end():
-    episode = Episode(
-        success=True, start_distance=3.0, path_length=3.0, decisions=2, collisions=0, seconds=9.0,
-        stop_distance=0.1, stop_heading=0.1, trajectory=np.array([[1.0, 1, 0], [1.5, 1, 0]]),
-        goal_pose=(3.0, 1.0, 0.0), search=one_wall())
-    plan = {'bounds': [0, 0, 6, 3], 'walls': [[0, 0, 6, 0.1]], 'obstacles': []}
-    assert search_map(episode, plan).startswith('<img alt="the map of the policy" src="data:')
+    assert search_map(EPISODE, PLAN).startswith('<img alt="the map of the policy" src="data:')
+
+
+@pytest.mark.parametrize('count, shown', [(0, 0), (1, 1), (3, 3), (9, 4)])
+def test_the_demos_page_shows_how_the_map_grew(tmp_path, count, shown):
+    known = {3 * k + 1: PlacedSearch(k, float(k), one_wall(), np.array([1.0, 1.0, 0.3]))
+             for k in range(count)}
+    look = np.zeros((8, 8, 3), np.uint8)
+    goal = [3.0, 1.0, 0.0, 0.0]
+    recorded = RecordedEpisode({'episode': 0, 'goal_pose': goal}, EPISODE, EPISODE.trajectory,
+                               look, {1: look}, known)
+    figures = summarise([EPISODE]) | {
+        'random': summarise([EPISODE]), 'scene': 'house:7', 'checkpoint': 'mine',
+        'max_decisions': 100, 'stop': 'arrival'}
+    write_report(tmp_path / 'page.html', [Drive(PLAN | {
+        'scene': 'house:7', 'area': 18.0, 'goals': [{'pose': goal}]}, [recorded])],
+        {'unseen': figures, 'date': 'today', 'seconds': 1.0})
+    page = (tmp_path / 'page.html').read_text()
+    assert page.count('alt="map"') == shown and page.count('<svg') == 1
+    assert ('map as it grew' in page) == (count > 0)
+    if count == 9:
+        assert 'its map at decision 1<' in page and '>25<' in page

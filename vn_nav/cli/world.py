@@ -172,12 +172,15 @@ def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False)
     Args:
         path: of the checkpoint.
         robot: file of the robot; None: the one that it was trained for.
-        any_camera: a robot file may have another camera than the policy was trained with.
+        any_camera: a robot file may have another camera than the policy was trained with, as far
+            as the policy can be shown its pictures.
 
     Raises:
         UserError: the robot has other actions or another camera.
     """
+    from vn_nav.observation import check_lens, crop_fraction
     from vn_nav.policy.checkpoint import load_checkpoint
+    from vn_nav.policy.network_config import SEARCH
     from vn_nav.robot import load_robot
     checkpoint = load_checkpoint(path)
     spec = load_robot(robot) if robot else _trained_robot(checkpoint.info)
@@ -185,7 +188,12 @@ def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False)
     spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
     present = math.degrees(spec.camera_fov), spec.camera_height
-    if not (any_camera and robot) and any(
+    if any_camera and robot:
+        if checkpoint.config.architecture == SEARCH:
+            check_lens(spec.camera_fov)
+        else:
+            crop_fraction(spec.camera_fov, math.radians(trained[0]))
+    elif any(
             abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
         raise UserError('the robot has the camera that the policy was trained with: '
                         f'{trained[0]:g} deg, {trained[1]:g} m high',

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vn_nav.policy.search.grid import CELL, KNOWN
+from vn_nav.policy.search.grid import CELL
 from vn_nav.policy.search.searcher import Searcher
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # cells of a snapshot, as of nav_msgs/OccupancyGrid
@@ -34,10 +34,7 @@ class Snapshot(NamedTuple):
 def snapshot(searcher: Searcher) -> Snapshot:
     """What a searcher knows now; a copy, cut to the known part of its map."""
     grid = searcher.grid
-    obstacles = grid.obstacles()
-    known = (grid.seen >= KNOWN) | grid.stood | obstacles
-    cells, origin = cut_to_known(np.where(obstacles, OCCUPIED, np.where(
-        known, FREE, UNKNOWN)).astype(np.int8), grid.origin, CELL)
+    cells, origin = cut_to_known(grid.occupancy(), grid.origin, CELL)
     guesses = sorted(searcher.hypotheses.all, key=lambda own: -own.weight)
     return Snapshot(
         cells, origin, CELL, searcher.pose.copy(),
