@@ -52,7 +52,7 @@ def write(folder, frame='odom'):
     writer = BagWriter(folder, topics)
     for k, seconds in enumerate((BEGIN, BEGIN + 0.5)):
         there = compose(ODOMETRY_START, np.array([float(k), 0.0, 0.0]))
-        message = stamped(fill_odometry(Odometry(), *there, np.zeros(3)), seconds)
+        message = stamped(fill_odometry(Odometry(), *there, np.zeros(4)), seconds)
         writer.write('odom', serialize_message(message), int(seconds * 1e9))
     late = BEGIN + 0.5
     for name, message in (('map', stamped(grid, late, frame)),

@@ -180,12 +180,12 @@ def _palette(film: Film, drawn: list[np.ndarray], count: int) -> Any:
             np.unique(np.linspace(0, len(film.pictures) - 1, 16).astype(int))]
     pictures = image.fromarray(np.concatenate([*some, _scaled(film.goal_picture)]))
     colours = pictures.quantize(count, dither=image.Dither.NONE).getpalette()
-    side = np.concatenate([frame[:, :WIDTH - PICTURE - GAP].reshape(-1, 3)
-                           for frame in drawn[::max(len(drawn) // 12, 1)]] + [
-                               drawn[-1][:, :WIDTH - PICTURE - GAP].reshape(-1, 3)])
-    found, counts = np.unique(side, axis=0, return_counts=True)
+    side = np.concatenate([frame[:, :WIDTH - PICTURE - GAP].reshape(-1, 3) for frame in (
+        *drawn[::max(len(drawn) // 12, 1)], drawn[-1])]).astype(np.int32)
+    found, counts = np.unique(side @ np.array([1 << 16, 1 << 8, 1], np.int32), return_counts=True)
     common = found[np.argsort(-counts, kind='stable')[:SAME - count]]
-    table = [*colours[:3 * count], *common.flatten().tolist()]
+    table = [*colours[:3 * count],
+             *np.stack([common >> 16, common >> 8 & 255, common & 255], axis=1).ravel().tolist()]
     palette = image.new('P', (1, 1))
     palette.putpalette(table + table[-3:] * (256 - len(table) // 3))
     return palette

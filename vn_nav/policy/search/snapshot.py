@@ -34,7 +34,9 @@ class Snapshot(NamedTuple):
 def snapshot(searcher: Searcher) -> Snapshot:
     """What a searcher knows now; a copy, cut to the known part of its map."""
     grid = searcher.grid
-    cells, origin = cut_to_known(grid.occupancy(), grid.origin, CELL)
+    # What it keeps off, also where it has hardly looked.
+    cells = np.where(grid.obstacles(), np.int8(OCCUPIED), grid.occupancy())
+    cells, origin = cut_to_known(cells, grid.origin, CELL)
     guesses = sorted(searcher.hypotheses.all, key=lambda own: -own.weight)
     return Snapshot(
         cells, origin, CELL, searcher.pose.copy(),
