@@ -100,7 +100,7 @@ def test_evaluate_prints_figures(tmp_path, capsys):
     result = json.loads(figures.read_text())
     assert list(result['splits']) == ['seen_goals'] and result['decoding'] == 'sample'
     rows = result['splits']['seen_goals']['rows']['arrival']
-    assert len(rows) == 6 and all(row['episodes'] == 6 for row in rows.values())
+    assert len(rows) == 7 and all(row['episodes'] == 6 for row in rows.values())
     assert page.read_text().count('<svg') == 6
 
 
