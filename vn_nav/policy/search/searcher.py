@@ -90,6 +90,7 @@ class Searcher:
         self._odometry: np.ndarray | None = None
         self._known: list[float] = []  # m^2, at the decisions of exploring
         self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
+        self._unturned: list[tuple[np.ndarray, int]] = []  # [3] poses, and where it could not turn
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
              unmoved: bool = False) -> int:
@@ -132,6 +133,8 @@ class Searcher:
         self.pose = np.array([before[0] + c * done[0] - s * done[1],
                               before[1] + s * done[0] + c * done[1],
                               wrap_angle(before[2] + done[2])])
+        if abs(done[2]) < 0.5 * abs(move[2]):
+            self._unturned.append((self.pose.copy(), 1 if move[2] > 0 else -1))
         wanted = float(np.hypot(*move[:2]))
         if wanted > 0:
             if np.hypot(*done[:2]) < 0.75 * wanted:
@@ -169,7 +172,8 @@ class Searcher:
             if own.is_stuck(0.0):
                 self.hypotheses.refute(own)
                 return None
-            if abs(turn) > self.rules.reached_rad and abs(turn) > 0.55 * self._turn:
+            if (abs(turn) > self.rules.reached_rad and abs(turn) > 0.55 * self._turn
+                    and not self._cannot_turn(np.array([np.sign(turn)]))[0]):
                 self.aim = 'turn'
                 return self._left if turn > 0 else self._right
             self.hypotheses.refute(own)  # it stands there, and it was not said to have arrived
@@ -198,7 +202,7 @@ class Searcher:
         gains = self.grid.look_gains(self.pose, self.pose[2] + turns * self._turn, self.bearings)
         worth = np.minimum(rules.look_worth * gains, rules.look_most)
         price = rules.look_cost * np.abs(turns) - np.where(gains >= rules.look_from, worth, -99.0)
-        price[turns == 0] = np.inf
+        price[(turns == 0) | self._cannot_turn(turns)] = np.inf
         price += np.where(self._turns_back(turns), rules.back_cost, 0)
         best = int(np.argmin(price))
         cells, head_start = costmap.frontiers()
@@ -233,7 +237,8 @@ class Searcher:
         rules = self.rules
         most = math.ceil(math.pi / self._turn)
         best, chosen = np.inf, None
-        for k in sorted(range(-most, most + 1), key=abs):
+        numbers = np.arange(-most, most + 1)
+        for k in sorted(numbers[~self._cannot_turn(numbers)].tolist(), key=abs):
             yaw = self.pose[2] + k * self._turn
             for action in self._drives:
                 dx, dy, _ = self.moves[action]
@@ -265,6 +270,12 @@ class Searcher:
         return any(gap < BLOCKED_M and turn < BLOCKED_RAD
                    for gap, turn in (apart(here, own) for own in self._blocked))
 
+    def _cannot_turn(self, turns: np.ndarray) -> np.ndarray:
+        """Which numbers of turns begin with one that odometry says was not done about here."""
+        ways = {way for pose, way in self._unturned
+                if (off := apart(self.pose, pose))[0] < BLOCKED_M and off[1] < BLOCKED_RAD}
+        return np.isin(np.sign(turns), list(ways))
+
     def _turns_back(self, turns: np.ndarray) -> np.ndarray:
         """Which numbers of turns begin by undoing the last action."""
         if self._last == self._left:
@@ -281,6 +292,9 @@ class Searcher:
                 costmap.free_length(self.pose, angle, length)[0] >= 0.9 * length)
             if free and (dx > 0 or self._last not in (self._left, self._right)):
                 return int(action)
+        right, left = self._cannot_turn(np.array([-1, 1]))
+        if left != right:
+            return self._left if right else self._right
         return self._right if self._last == self._right else self._left
 
 
