@@ -11,7 +11,8 @@ from vn_nav.errors import UserError
 from vn_nav.policy.search.look import COLUMNS, column_bearings
 from vn_nav.scenes import house_scenes
 from vn_sim_bridge.datasets.view_pairs import PairSampler
-from vn_sim_bridge.datasets.view_ranges import ranges_of_depth, ray_cast
+from vn_sim_bridge.datasets.view_ranges import ranges_of_depth
+from vn_sim_bridge.floor.rays import ray_cast
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.simulator import cameras_at
 

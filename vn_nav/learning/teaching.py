@@ -212,7 +212,7 @@ class Teaching:
         odometry = self._odometry(taught.network)
         result = new_result(info, checkpoint=str(self.folder), bag=self.bag.name,
                             max_decisions=MAX_DECISIONS, decoding=DECODING, seed=EVALUATION_SEED,
-                            odometry=odometry)
+                            odometry=odometry, ranges='picture')
         graphs = {name: graph for name, graph in self._graphs().items() if graph is not None}
         self.evaluation = Evaluation(
             self.out, result, graphs,

@@ -15,8 +15,10 @@ from std_msgs.msg import Bool, Int8, String
 
 from vn_msgs_py import images
 from vn_nav.nodes.command_output import CommandOutput
+from vn_nav.nodes.map_output import MapOutput
 from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.range_input import RangeInput
 from vn_nav.nodes.window import Window
 from vn_nav.observation import needed_side
 from vn_nav.policy.action_filter import NONE
@@ -25,6 +27,9 @@ from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 
 WINDOW_S = 5.0  # that rates and latencies are measured over
+# That a picture waits for the ranges measured with it: scanners turn 10 times a second. In
+# lock-step only topics are not in order.
+RANGES_PATIENCE_S, LOCK_STEP_RANGES_PATIENCE_S = 0.15, 1.0
 
 
 class Executed(NamedTuple):
@@ -47,6 +52,7 @@ class DecisionWorker:
         wake: guards the navigator and what this object keeps.
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
         shadow: decide only after `note_executed`, for a robot that somebody else drives.
+        ranges: measured ranges for the map; None: it takes those that are seen in the pictures.
 
     Attributes:
         camera_fov: field of view of the camera's shorter side [rad], as far as it is known.
@@ -56,11 +62,13 @@ class DecisionWorker:
 
     def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
                  output: CommandOutput, wake: threading.Condition, *, lock_step: bool,
-                 shadow: bool = False):
+                 shadow: bool = False, ranges: RangeInput | None = None):
         self._node, self._navigator, self._runtime = node, navigator, runtime
         self._output, self._wake, self._lock_step = output, wake, lock_step
         self._breaks = output.track.breaks  # of the odometry, that the runtime knows of
-        self._shadow = shadow
+        self._shadow, self._ranges = shadow, ranges
+        self._waits_from: float | None = None  # steady time [s]: pictures wait for ranges
+        self._map = None if runtime.search is None else MapOutput(node)
         self._executed: Executed | None = None
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
         self.camera_fov: float | None = None
@@ -75,6 +83,7 @@ class DecisionWorker:
             node.create_publisher(kind, name, qos(name)) for kind, name in (
                 (Int8, 'action'), (String, 'action_names'), (Bool, 'arrived'))]
         names.publish(String(data=json.dumps(list(runtime.action_names))))
+        self.publishers += [] if self._map is None else self._map.publishers
         self.publish_arrival()
 
     def show_frame(self, message, stamp: float, received: float) -> None:
@@ -206,6 +215,9 @@ class DecisionWorker:
             executed = self._executed if self._shadow else None
             if self._shadow and (executed is None or stamp < executed.stamp):
                 return
+            if not self._has_ranges(stamp):
+                return
+            now = time.monotonic()
             ticket = self._navigator.request(stamp, now)
             if ticket is None:
                 return
@@ -217,8 +229,9 @@ class DecisionWorker:
         if breaks != self._breaks:
             self._breaks = breaks
             self._runtime.reset_odometry()
+        scan = None if self._ranges is None else self._ranges.scan_at(stamp)
         try:
-            action = self._runtime.act(picture, pose, zoom)
+            action = self._runtime.act(picture, pose, scan, zoom)
         except FloatingPointError as error:
             with self._wake:
                 self._navigator.stop(str(error), time.monotonic())
@@ -236,6 +249,32 @@ class DecisionWorker:
                 if self._navigator.decided(ticket, action, now):
                     self._action.publish(Int8(data=action))
             self._wake.notify_all()
+        if self._map is not None and self._runtime.search is not None:
+            self._map.publish(self._runtime.search.searchers[0], pose,
+                              self._output.odometry_frame, message.header.stamp)
+
+    def _has_ranges(self, stamp: float) -> bool:
+        """Wait a moment for the ranges measured with a picture that a decision needs.
+
+        Returns:
+            False: a newer picture has come meanwhile, which may wait for the rest of that moment.
+        """
+        ranges = self._ranges
+        if ranges is None or not ranges.is_alive or not self._navigator.wants(stamp):
+            self._waits_from = None
+            return True
+        now = time.monotonic()
+        self._waits_from = self._waits_from or now
+        patience = LOCK_STEP_RANGES_PATIENCE_S if self._lock_step else RANGES_PATIENCE_S
+        self._wake.wait_for(
+            lambda: (ranges.has(stamp) or self._frame is not None or self._goal is not None
+                     or not self._navigator.wants(stamp)),
+            timeout=max(self._waits_from + patience - now, 0.0))
+        if self._frame is not None and not ranges.has(stamp) and (
+                time.monotonic() < self._waits_from + patience):
+            return False
+        self._waits_from = None
+        return True
 
     def _prepare(self, message) -> tuple[np.ndarray, float]:
         fov = self.camera_fov

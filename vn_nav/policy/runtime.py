@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.measured_ranges import Scan, Scanner
 from vn_nav.observation import (
     Observation,
     check_lens,
@@ -195,7 +196,8 @@ class PolicyRuntime:
         return self.stop_threshold is not None and self.arrival > self.stop_threshold
 
     @torch.inference_mode()
-    def act(self, image: np.ndarray, odometry: np.ndarray | None = None, zoom: float = 1.0) -> int:
+    def act(self, image: np.ndarray, odometry: np.ndarray | None = None,
+            scan: Scan | None = None, zoom: float = 1.0) -> int:
         """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
@@ -207,6 +209,8 @@ class PolicyRuntime:
                 the same until `reset_odometry`, `reset` or `set_goal`; what counts is how it
                 changes. None: unknown at this picture; the frame stays. Of use to a policy that
                 searches alone.
+            scan: ranges that were measured there, which its map takes in place of those that it
+                sees in the picture. None: there are none at this picture.
             zoom: of picture and goal, as `prepare` says.
 
         Raises:
@@ -220,7 +224,7 @@ class PolicyRuntime:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
         if self.search is not None:
-            return self._search_on(picture, odometry, zoom)
+            return self._search_on(picture, odometry, scan, zoom)
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -242,12 +246,14 @@ class PolicyRuntime:
             self.reset()
         return action
 
-    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, zoom: float) -> int:
+    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, scan: Scan | None,
+                   zoom: float) -> int:
         """`act` of a policy that searches."""
         assert self.search is not None and self._goal_maps is not None
         action = int(self.search.act(
             picture.numpy(), self._goal_maps, np.array([self._last_action]),
-            np.array([self._starts]), None if odometry is None else odometry[None], zoom)[0])
+            np.array([self._starts]), None if odometry is None else odometry[None], [scan],
+            zoom)[0])
         self.arrival = float(self.search.arrival[0])
         self._last_action, self._starts = action, False
         if self.arrived:
@@ -273,6 +279,7 @@ class BatchedPolicy:
         seed: of the sampled actions.
         zoom: how many times the robots' lens magnifies against the policy's, for one that
             searches; see `vn_nav.policy.search.lens`.
+        scanner: what measures the `scan` of observations, if the robots have one.
 
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
@@ -284,9 +291,10 @@ class BatchedPolicy:
     """
 
     def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0,
-                 zoom: float = 1.0):
+                 scanner: Scanner | None = None, zoom: float = 1.0):
         _check_decoding(decoding)
-        self.network, self.decoding, self._zoom = network, decoding, zoom
+        self.network, self.decoding, self.scanner = network, decoding, scanner
+        self._zoom = zoom
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self.logits: torch.Tensor | None = None
@@ -312,7 +320,8 @@ class BatchedPolicy:
             obs: `image` [N,3,S,S] uint8, `goal_index` [N], `last_action` [N], `last_reward` [N];
                 `features` [N,F] float32, if somebody has computed them, see `takes_features`;
                 `odometry` [N,3] float64, if the robots have it: x, y [m], yaw [rad] in a frame of
-                the episode (a network that does not use it ignores it).
+                the episode (a network that does not use it ignores it); `scan` [N,K] float32 m,
+                ranges along the bearings of the `scanner`, for the map of a policy that has one.
             goals: [G,3,S,S] uint8, or their features [G,F] float32; encoded again only when
                 another array is passed, so do not write into one.
             reset_mask: [N] bool, where an episode begins with this observation.
@@ -334,8 +343,10 @@ class BatchedPolicy:
                                   torch.from_numpy(np.asarray(obs['goal_index'])))
         last_action, reset_mask = np.asarray(obs['last_action']), np.asarray(reset_mask, bool)
         if self.search is not None:
+            scans = None if self.scanner is None else [
+                Scan(self.scanner, ranges) for ranges in obs['scan']]
             chosen = self.search.act(obs['image'], maps, last_action, reset_mask,
-                                     obs.get('odometry'), self._zoom)
+                                     obs.get('odometry'), scans, self._zoom)
             self.arrival = self.search.arrival.copy()
             return chosen
         observation = Observation(

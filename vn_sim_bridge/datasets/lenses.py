@@ -17,13 +17,13 @@ from vn_sim_bridge.simulator import Frames
 class Lenses:
     """What is drawn for each group of views, which share a camera."""
 
-    share: float = 0.4  # of the groups that have another lens than the robot's
+    share: float = 0.3  # of the groups that have another lens than the robot's
     fov_deg: tuple[float, float] = (55.0, 100.0)  # horizontal, drawn between
-    wide_share: float = 0.25  # of the groups whose pictures are wider than high
+    wide_share: float = 0.2  # of the groups whose pictures are wider than high
     least_aspect: float = 0.5  # height of the picture, in widths
-    mast_share: float = 0.25  # of the groups whose cameras are at another height
+    mast_share: float = 0.2  # of the groups whose cameras are at another height
     mast: tuple[float, float] = (0.3, 1.7)  # m above the floor, drawn between
-    pitched_share: float = 0.4  # of the groups whose cameras look up or down
+    pitched_share: float = 0.15  # of the groups whose cameras look up or down
     pitch_deg: tuple[float, float] = (-10.0, 38.0)  # down, drawn between
     swayed_share: float = 0.5  # of those, whose views are pitched apart, as of a hand-held camera
     sway_deg: float = 10.0  # off the group's pitch, at most

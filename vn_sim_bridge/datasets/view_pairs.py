@@ -20,10 +20,11 @@ from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
 from vn_sim_bridge.datasets.lenses import Lenses, cut
 from vn_sim_bridge.datasets.pair_poses import PLACERS, TRIES, USUAL
-from vn_sim_bridge.datasets.view_ranges import ranges_of_depth, ray_cast
+from vn_sim_bridge.datasets.view_ranges import ranges_of_depth
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import CELL, FloorMap
 from vn_sim_bridge.floor.places import FloorPlace, WalledPlace
+from vn_sim_bridge.floor.rays import ray_cast
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.simulator import Frames, Place, Setup

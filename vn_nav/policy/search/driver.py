@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from vn_nav.measured_ranges import Scan, laser_scan
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
 from vn_nav.policy.search.lens import bearings_through, in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
@@ -44,10 +47,12 @@ class SearchDriver:
                           np.array([1.0, 0.0]), 0.3, np.array([1.0, 0.0]), co_visible, 0.0)
             for action in (-1, int(np.argmax(searcher.moves[:, 0]))):  # the second meets something
                 searcher.step(sight, action, np.zeros(3))
+            searcher.step(sight, -1, np.zeros(3), scan=laser_scan(np.ones(4), 0.0, 1.0, 0.1, 2.0))
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
-            starts: np.ndarray, odometry: np.ndarray | None, zoom: float = 1.0) -> np.ndarray:
+            starts: np.ndarray, odometry: np.ndarray | None,
+            scans: Sequence[Scan | None] | None = None, zoom: float = 1.0) -> np.ndarray:
         """Actions [N] int64.
 
         Args:
@@ -57,6 +62,7 @@ class SearchDriver:
             starts: [N] bool, where an episode begins: map and hypotheses are empty.
             odometry: [N,3] x, y [m], yaw [rad]; None: nobody has any.
             zoom: how many times the lens of pictures and goals magnifies, see `lens`.
+            scans: [N] measured ranges; None: of nobody, or not of this robot at this picture.
 
         Raises:
             FloatingPointError: what the networks say is not finite.
@@ -77,7 +83,8 @@ class SearchDriver:
             searcher.bearings = bearings
             actions[n] = searcher.step(sight, -1 if starts[n] else int(last_action[n]),
                                        None if odometry is None else odometry[n],
-                                       unmoved=bool(still[n]) and not starts[n])
+                                       unmoved=bool(still[n]) and not starts[n],
+                                       scan=None if scans is None else scans[n])
             self.arrival[n] = searcher.arrival
         return actions
 
