@@ -9,7 +9,7 @@ import numpy as np
 
 from vn_nav.errors import UserError
 from vn_nav.evaluation.metrics import Episode, summarise
-from vn_nav.observation import preprocess, through_lens
+from vn_nav.observation import preprocess
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.runtime import BatchedPolicy
@@ -189,11 +189,8 @@ class PolicyActor:
                 self.env.robot.camera_fov <= (1 + SAME_FOV) * self._camera_fov):
             return pictures
         fov = self.env.robot.camera_fov
-        lens = {'fov': fov, 'target_fov': self._camera_fov}
-        upright = pictures.transpose(0, 2, 3, 1)
-        if self.policy.search is not None and self._camera_fov is not None:
-            return np.stack([through_lens(own, self._size, **lens)[0] for own in upright])
-        return np.stack([preprocess(own, self._size, **lens) for own in upright])
+        return np.stack([preprocess(picture.transpose(1, 2, 0), self._size, fov=fov,
+                                    target_fov=self._camera_fov) for picture in pictures])
 
 
 def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decoding: str,
