@@ -3,7 +3,7 @@
     python bench/photographs.py FOLDER --checkpoint models/search
     python bench/photographs.py FOLDER --cameras known width level grey --no-drive
     python bench/photographs.py FOLDER --episodes 60 --json photographs.json
-    python bench/photographs.py FOLDER --features --no-drive      # SIFT beside it
+    python bench/photographs.py FOLDER --features sift xfeat --no-drive --every 6
 
 The folder is described in `photo_sequence.py`. Reports, for each way to take a photograph for the
 policy's camera (`CAMERAS`):
@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from photo_features import FEATURES, inliers
+from photo_features import FEATURES, matched
 from photo_sequence import Camera, Sequence
 
 from vn_nav.arrival import ARRIVAL_RADIUS
@@ -249,8 +249,9 @@ def run(options: argparse.Namespace) -> None:
         rows[name] = judge(pairs, said.co_visible.numpy(), said.position.numpy(),
                            said.heading.numpy(), said.co_visible.numpy() > 0,
                            said.arrived.numpy())
-    for name in FEATURES if options.features else ():
-        rows[name] = judge(pairs, inliers(name, sequence, pairs.chosen)[pairs.first, pairs.second])
+    for name in options.features:
+        for kind, counts in matched(name, sequence, pairs.chosen).items():
+            rows[f'{name}, {kind}'] = judge(pairs, counts[pairs.first, pairs.second])
     print_table(rows)
     result = {'checkpoint': str(options.checkpoint), 'pairs': len(pairs.first), 'sight': rows}
     if options.drive:
@@ -275,7 +276,8 @@ def main() -> int:
     parser.add_argument('--cameras', nargs='+', default=['width'], metavar='CAMERA',
                         help='the first one drives')
     parser.add_argument('--every', type=int, default=EVERY, help='photographs: every so many')
-    parser.add_argument('--features', action='store_true', help='judge local features as well')
+    parser.add_argument('--features', nargs='+', choices=FEATURES, default=(),
+                        help='judge local features of the photographs as well')
     parser.add_argument('--no-drive', dest='drive', action='store_false')
     parser.add_argument('--episodes', type=int, default=60)
     parser.add_argument('--decisions', type=int, default=100, help='of an episode, at most')
