@@ -326,6 +326,16 @@ def test_a_move_that_met_something_is_not_tried_again_there():
     assert len(directions) == len(set(directions)) <= 12
 
 
+def test_a_turn_that_was_not_done_is_not_tried_again_there():
+    own, pose, asked = searcher(), np.zeros(3), [-1]
+    for _ in range(10):  # whatever it looks for, it cannot turn right
+        asked.append(own.step(sight(ranges=one_hot(room(pose))), asked[-1], pose))
+        dx, _, dyaw = MOVES[asked[-1]]
+        pose = pose + (dx * math.cos(pose[2]), dx * math.sin(pose[2]), max(dyaw, 0.0))
+    assert asked[1] == RIGHT and asked.count(LEFT) > 4
+    assert not any(asked[k] == asked[k + 1] == RIGHT for k in range(10))
+
+
 def test_the_same_looks_make_the_same_decisions():
     def drive():
         own, rng = searcher(), np.random.default_rng(3)
