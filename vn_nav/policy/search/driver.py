@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
+from vn_nav.policy.search.key_pictures import KeyPictures, Mode
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.recall import Recall
 from vn_nav.policy.search.searcher import Rules, Searcher, Sight
 
 
@@ -22,6 +26,7 @@ class SearchDriver:
 
     Attributes:
         searchers: [N], with map and hypotheses of each robot.
+        recalls: [N], what each recalls of the place that the network was taught; None: of none.
         arrival: [N] float32 probability that the robots have arrived, at the newest pictures.
     """
 
@@ -31,6 +36,11 @@ class SearchDriver:
         bearings = column_bearings(config.view)
         self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint, rules)
                           for _ in range(num_envs)]
+        place = network.taught
+        self._keys = None if place is None else KeyPictures(network, place)
+        self.recalls = None if place is None or self._keys is None else [
+            Recall(place, self._keys) for _ in range(num_envs)]
+        self._goal: tuple[Tensor, list[Mode]] | None = None
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self._before: np.ndarray | None = None
         self._compile(Searcher(config.moves, bearings, RANGE_EDGES, config.footprint))
@@ -43,6 +53,16 @@ class SearchDriver:
                           np.array([1.0, 0.0]), 0.3, np.array([1.0, 0.0]), co_visible, 0.0)
             for action in (-1, int(np.argmax(searcher.moves[:, 0]))):  # the second meets something
                 searcher.step(sight, action, np.zeros(3))
+
+    def prepare(self, goal_maps: Tensor) -> None:
+        """Look for a goal [1,...] in the taught place now, so that the first `act` need not."""
+        if self._keys is not None:
+            self._goal = goal_maps, self._keys.poses_of_goal(goal_maps)
+
+    def _poses_of_goal(self, keys: KeyPictures, goal_maps: Tensor) -> list[Mode]:
+        if self._goal is not None and goal_maps.equal(self._goal[0]):
+            return self._goal[1]
+        return keys.poses_of_goal(goal_maps)
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
@@ -59,7 +79,8 @@ class SearchDriver:
         Raises:
             FloatingPointError: what the networks say is not finite.
         """
-        look = self.network.look(torch.from_numpy(image), goal_maps)
+        pictures = torch.from_numpy(image)
+        look = self.network.look(pictures, goal_maps)
         if not all(torch.isfinite(part).all() for part in look):
             raise FloatingPointError('what the policy sees is not finite')
         sights = sights_of(look)
@@ -71,9 +92,15 @@ class SearchDriver:
         for n, (searcher, sight) in enumerate(zip(self.searchers, sights, strict=True)):
             if starts[n]:
                 searcher.reset()
+            recall = None
+            if self.recalls is not None and self._keys is not None:
+                own = self.recalls[n]
+                if starts[n]:
+                    own.begin(self._poses_of_goal(self._keys, goal_maps[n:n + 1]))
+                recall = functools.partial(own.look, image=pictures[n:n + 1])
             actions[n] = searcher.step(sight, -1 if starts[n] else int(last_action[n]),
                                        None if odometry is None else odometry[n],
-                                       unmoved=bool(still[n]) and not starts[n])
+                                       unmoved=bool(still[n]) and not starts[n], recall=recall)
             self.arrival[n] = searcher.arrival
         return actions
 

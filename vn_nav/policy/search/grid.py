@@ -8,6 +8,7 @@ along. Kernels run in NumPy's memory, compiled; torch is not needed.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -31,6 +32,7 @@ class OccupancyGrid:
 
     Args:
         footprint: radius of the robot [m].
+        side: cells; middle: [2] m, of the map.
 
     Attributes:
         log_odds: [SIDE,SIDE] float32, rows along y.
@@ -38,18 +40,22 @@ class OccupancyGrid:
         missed: [SIDE,SIDE] int16: looks that should have shown it, by the map, and did not.
         stood: [SIDE,SIDE] bool: the robot was on it; been: its centre was.
         contacts: [SIDE,SIDE] bool: it met something here.
+        prior: `log_odds` and `seen` of somebody who knows the place, for cells that the robot has
+            not seen itself; None: nobody, or the map has moved.
         origin: [2] m, of the lower left corner.
     """
 
-    def __init__(self, footprint: float):
+    def __init__(self, footprint: float, side: int = SIDE, middle: Sequence[float] = (0.0, 0.0)):
         self.footprint = footprint
-        self.log_odds = np.zeros((SIDE, SIDE), np.float32)
-        self.seen = np.zeros((SIDE, SIDE), np.float32)
-        self.missed = np.zeros((SIDE, SIDE), np.int16)
-        self.stood = np.zeros((SIDE, SIDE), bool)
-        self.been = np.zeros((SIDE, SIDE), bool)
-        self.contacts = np.zeros((SIDE, SIDE), bool)
-        self.origin = np.array([-CELL * SIDE / 2, -CELL * SIDE / 2])
+        self.log_odds = np.zeros((side, side), np.float32)
+        self.seen = np.zeros((side, side), np.float32)
+        self.missed = np.zeros((side, side), np.int16)
+        self.stood = np.zeros((side, side), bool)
+        self.been = np.zeros((side, side), bool)
+        self.contacts = np.zeros((side, side), bool)
+        self.origin = np.asarray(middle, float) - CELL * side / 2
+        self.prior: tuple[np.ndarray, np.ndarray] | None = None
+        self._prior_counts = True
 
     def add_ranges(self, pose: np.ndarray, bearings: np.ndarray, ranges: np.ndarray,
                    edges: np.ndarray) -> None:
@@ -84,9 +90,10 @@ class OccupancyGrid:
                                  pose[1], heading + bearings, False) for heading in headings])
 
     def forget_looks(self) -> None:
-        """Let everything be looked at again; obstacles and free floor stay."""
+        """Let everything be looked at again; own obstacles and free floor stay, no prior."""
         self.seen *= 0.2
         self.missed[:] = 0
+        self._prior_counts = False
 
     def known_area(self) -> float:
         """Floor that was seen [m^2]."""
@@ -95,7 +102,7 @@ class OccupancyGrid:
     def give_up(self, cell: tuple[int, int], radius: float) -> None:
         """Let nothing within a radius [m] of a cell be looked for any more."""
         x, y = self.origin + CELL * (np.array(cell[::-1]) + 0.5)
-        done = np.zeros((SIDE, SIDE), bool)
+        done = np.zeros(self.seen.shape, bool)
         _disc(done, self.origin, x, y, radius, True)
         self.missed[done] = MISSES
 
@@ -114,32 +121,42 @@ class OccupancyGrid:
 
     def obstacles(self) -> np.ndarray:
         """[SIDE,SIDE] bool."""
-        return ((self.log_odds > OCCUPIED) & ~self.stood) | self.contacts
+        odds = self.log_odds
+        if self.prior is not None and self._prior_counts:
+            own = (self.seen >= KNOWN) | (np.abs(odds) > OCCUPIED)
+            odds = np.where(own, odds, self.prior[0])
+        return ((odds > OCCUPIED) & ~self.stood) | self.contacts
 
     def unknown(self) -> np.ndarray:
         """[SIDE,SIDE] bool: hardly seen."""
-        return (self.seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
+        seen = self.seen
+        if self.prior is not None and self._prior_counts:
+            seen = seen + self.prior[1]
+        return (seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """Row and column of a place; outside, of the nearest cell."""
         column, row = ((np.array([x, y]) - self.origin) / CELL).astype(int)
-        return int(np.clip(row, 0, SIDE - 1)), int(np.clip(column, 0, SIDE - 1))
+        side = len(self.seen)
+        return int(np.clip(row, 0, side - 1)), int(np.clip(column, 0, side - 1))
 
     def _follow(self, pose: np.ndarray) -> None:
         """Move the map where the robot comes near its edge; what falls off is forgotten."""
+        side = len(self.seen)
         column, row = np.floor((np.asarray(pose[:2]) - self.origin) / CELL).astype(int)
-        if MARGIN <= row < SIDE - MARGIN and MARGIN <= column < SIDE - MARGIN:
+        if MARGIN <= row < side - MARGIN and MARGIN <= column < side - MARGIN:
             return
-        shift = np.array([column, row]) - SIDE // 2
+        shift = np.array([column, row]) - side // 2
         for name in ('log_odds', 'seen', 'missed', 'stood', 'been', 'contacts'):
             old = getattr(self, name)
             new = np.zeros_like(old)
-            rows, columns = (np.arange(SIDE) + s for s in shift[::-1])
-            inside = np.ix_((rows >= 0) & (rows < SIDE), (columns >= 0) & (columns < SIDE))
-            new[inside] = old[np.ix_(rows[(rows >= 0) & (rows < SIDE)],
-                                     columns[(columns >= 0) & (columns < SIDE)])]
+            rows, columns = (np.arange(side) + s for s in shift[::-1])
+            inside = np.ix_((rows >= 0) & (rows < side), (columns >= 0) & (columns < side))
+            new[inside] = old[np.ix_(rows[(rows >= 0) & (rows < side)],
+                                     columns[(columns >= 0) & (columns < side)])]
             setattr(self, name, new)
         self.origin = self.origin + CELL * shift
+        self.prior = None
 
 
 @numba.njit(cache=True)

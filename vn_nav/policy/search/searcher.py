@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -92,7 +92,7 @@ class Searcher:
         self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
-             unmoved: bool = False) -> int:
+             unmoved: bool = False, recall: Callable[[Searcher], None] | None = None) -> int:
         """The next action.
 
         Args:
@@ -100,6 +100,7 @@ class Searcher:
             last_action: what was done before it; -1: nothing.
             odometry: [3] pose, if the robot has odometry; what counts is how it changes.
             unmoved: without odometry: the picture is as before the action.
+            recall: brings to mind what is known of the place; called before the decision.
         """
         self._move(last_action, odometry, unmoved)
         self.grid.add_footprint(self.pose)
@@ -107,6 +108,8 @@ class Searcher:
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
         self.arrival = sight.arrived
+        if recall is not None:
+            recall(self)
         action = self._decide()
         self._last = action
         return action
