@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import torch
 
@@ -20,7 +21,7 @@ MOST_KEYS = 400  # beyond, key pictures are chosen farther apart
 WIDER = 1.1  # times, until they are few enough
 PLAIN = 8.0  # grey levels: a picture that varies less tells no place
 BATCH = 64  # pictures
-MOST_DRAWN = 1000  # pictures that the map is drawn by, at most
+LANE_M = 0.1  # about where the robot's centre was: pictures along a drive are that far apart
 
 
 def choose_keys(pictures: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -69,15 +70,18 @@ def recall_drive(network: SearchPolicy, pictures: np.ndarray, poses: np.ndarray,
                         f'{(high - low).max():.0f} m', 'teach a part of the drive (--pictures)')
     grid = OccupancyGrid(config.footprint, side, (low + high) / 2)
     bearings = column_bearings(config.view)
-    drawn = np.unique(np.linspace(0, len(poses) - 1, MOST_DRAWN).astype(int))
-    for start in range(0, len(drawn), BATCH):
-        show(start / len(drawn))
-        rows = drawn[start:start + BATCH]
+    # By key pictures alone: of views so near one another the ranges err together, and many of them
+    # would outvote the walls that others see.
+    for start in range(0, len(keys), BATCH):
+        show(start / len(keys))
+        rows = keys[start:start + BATCH]
         ranges = network.ranges(torch.from_numpy(pictures[rows]), network.compute_dtype)
         for pose, own in zip(poses[rows], ranges.exp().numpy(), strict=True):
             grid.add_ranges(pose, bearings, own, RANGE_EDGES)
     for pose in poses:
         grid.add_footprint(pose)
+    off = cv2.distanceTransform((~grid.been).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    lane = CELL * off <= LANE_M
     # The robot stood there, whatever its ranges say.
     log_odds = np.where(grid.stood, -MOST, grid.log_odds).astype(np.float32)
     seen = np.where(grid.stood, np.maximum(grid.seen, 1.0), grid.seen).astype(np.float32)
@@ -85,5 +89,6 @@ def recall_drive(network: SearchPolicy, pictures: np.ndarray, poses: np.ndarray,
     (r0, c0), (r1, c1) = inside.min(axis=0), inside.max(axis=0) + 1
     return TaughtPlace(
         np.ascontiguousarray(pictures[keys]), poses[keys].astype(np.float32),
-        np.ascontiguousarray(log_odds[r0:r1, c0:c1]), np.ascontiguousarray(seen[r0:r1, c0:c1]),
+        *(np.ascontiguousarray(layer[r0:r1, c0:c1], np.float32)
+          for layer in (log_odds, seen, lane)),
         (grid.origin + CELL * np.array([c0, r0])).astype(np.float32))

@@ -30,7 +30,7 @@ class SearchTeaching(Teaching):
     def learn(self) -> None:
         """Keep key pictures, and draw the map."""
         assert self.given is not None
-        network = load_checkpoint(self.job.checkpoint or '').network  # the given one stays as it is
+        network = load_checkpoint(self.job.checkpoint or '').network  # the given one stays
         assert isinstance(network, SearchPolicy)  # by its architecture
         begun, graph = time.monotonic(), self.graph
         rows = np.arange(len(graph.poses))

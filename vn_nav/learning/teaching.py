@@ -150,7 +150,7 @@ class Teaching:
         stages: of the command, and its minutes.
 
     Attributes:
-        evaluation_share: of the minutes left when the bag is read, at most; learning gets the rest.
+        evaluation_share: of the minutes left when the bag is read, at most; the rest is learning.
     """
 
     evaluation_share = EVALUATION_TIME_SHARE
@@ -302,7 +302,7 @@ class Teaching:
         return Watched(source, lambda: self.stages('picture pairs', 0.0)), judge
 
     def _candidate(self, seconds: float) -> Policy:
-        """A policy that costs as much as the one to be measured, for so many seconds of learning."""
+        """A policy that costs as much as that to be measured, for so many seconds of learning."""
         return self._network(self._config(seconds, seconds))
 
     def _network(self, config: TrainConfig) -> Policy:

@@ -1,6 +1,7 @@
 """Checkpoints: a folder with `model.safetensors`, `config.json` and a model card, `README.md`.
 
-One of a policy that searches and was taught a place has `place.safetensors` as well. Nothing in it is executable: weights are safetensors, everything else is JSON and text.
+One of a policy that searches and was taught a place has `place.safetensors` as well. Nothing in it
+is executable: weights are safetensors, everything else is JSON and text.
 """
 
 from __future__ import annotations

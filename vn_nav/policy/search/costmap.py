@@ -9,7 +9,7 @@ import cv2
 import numba
 import numpy as np
 
-from vn_nav.policy.search.grid import CELL, OccupancyGrid
+from vn_nav.policy.search.grid import CELL, KNOWN, OccupancyGrid
 
 KEEP = 0.04  # m beyond the footprint that is passable: a cell's edge is half a cell off
 KEEP_OFF = 0.2  # m beyond the footprint within which a way costs more
@@ -46,6 +46,12 @@ class Costmap:
         self.passable = (self.clearance > limit) | grid.been
         close = np.clip((limit + KEEP_OFF - self.clearance) / KEEP_OFF, 0, 1)
         price = 1 + CLOSE_COST * close + UNKNOWN_COST * self.unknown
+        lane = grid.lane()
+        if lane is not None:
+            # Where a robot has driven is the surest way; where it has only seen floor, as good as
+            # none: what lies between may be a wall that its eyes missed.
+            self.passable |= lane
+            price = np.where(lane, 1, price + UNKNOWN_COST * ((grid.seen < KNOWN) & ~self.unknown))
         self.cost = np.where(self.passable, price, 0).astype(np.float32)
 
     def frontiers(self) -> tuple[np.ndarray, np.ndarray]:

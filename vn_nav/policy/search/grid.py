@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -27,6 +28,14 @@ MISSES = 3  # looks that should have shown a cell by the map, and did not: it is
 VIEW = 2.5  # m to which a look is expected to show floor
 
 
+class Prior(NamedTuple):
+    """What somebody knows of the cells of a map, [SIDE,SIDE] float32 each."""
+
+    log_odds: np.ndarray
+    seen: np.ndarray
+    lane: np.ndarray  # 1: a robot's centre was here
+
+
 class OccupancyGrid:
     """The map of one robot.
 
@@ -40,8 +49,8 @@ class OccupancyGrid:
         missed: [SIDE,SIDE] int16: looks that should have shown it, by the map, and did not.
         stood: [SIDE,SIDE] bool: the robot was on it; been: its centre was.
         contacts: [SIDE,SIDE] bool: it met something here.
-        prior: `log_odds` and `seen` of somebody who knows the place, for cells that the robot has
-            not seen itself; None: nobody, or the map has moved.
+        prior: of somebody who knows the place, for cells that the robot has not seen itself; None:
+            nobody, or the map has moved.
         origin: [2] m, of the lower left corner.
     """
 
@@ -54,7 +63,7 @@ class OccupancyGrid:
         self.been = np.zeros((side, side), bool)
         self.contacts = np.zeros((side, side), bool)
         self.origin = np.asarray(middle, float) - CELL * side / 2
-        self.prior: tuple[np.ndarray, np.ndarray] | None = None
+        self.prior: Prior | None = None
         self._prior_counts = True
 
     def add_ranges(self, pose: np.ndarray, bearings: np.ndarray, ranges: np.ndarray,
@@ -124,15 +133,24 @@ class OccupancyGrid:
         odds = self.log_odds
         if self.prior is not None and self._prior_counts:
             own = (self.seen >= KNOWN) | (np.abs(odds) > OCCUPIED)
-            odds = np.where(own, odds, self.prior[0])
+            odds = np.where(own, odds, self.prior.log_odds)
         return ((odds > OCCUPIED) & ~self.stood) | self.contacts
 
     def unknown(self) -> np.ndarray:
         """[SIDE,SIDE] bool: hardly seen."""
         seen = self.seen
         if self.prior is not None and self._prior_counts:
-            seen = seen + self.prior[1]
+            seen = seen + self.prior.seen
         return (seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
+
+    def lane(self) -> np.ndarray | None:
+        """[SIDE,SIDE] bool: the prior says that a robot has driven here; None: there is no prior.
+
+        Nothing that this robot has seen, or touched, speaks against it.
+        """
+        if self.prior is None or not self._prior_counts:
+            return None
+        return (self.prior.lane > 0.5) & (self.log_odds <= OCCUPIED) & ~self.contacts
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """Row and column of a place; outside, of the nearest cell."""

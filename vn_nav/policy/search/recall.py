@@ -15,22 +15,22 @@ import torch
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.pose_graph import between, compose
-from vn_nav.policy.search.grid import CELL
+from vn_nav.policy.search.grid import CELL, Prior
 from vn_nav.policy.search.hypotheses import Hypothesis, apart
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
 from vn_nav.policy.search.searcher import Searcher
 from vn_nav.policy.search.taught import TaughtPlace
 
 SAME_M, SAME_RAD = 0.8, math.radians(35)  # looks that say poses so near say one
-FADE = 0.35  # of what earlier looks said, at a look that is sure
+FADE = 0.2  # of what earlier looks said, at a look that is sure
 MISSED_BELOW, MISSED = 0.35, 0.7  # co-visibility of the views about it that speaks against a pose
 LEAST_GAIN = 0.15  # of the newest look for the pose: odometry drifts
 PRECISION_MOST = 200.0  # 1/m^2
 FORGET = 0.05  # weight under which a pose is dropped
 SURE, LEAD = 1.2, 2.0  # weight, and times that of the next pose, from which on a pose is believed
-DOUBTED, DOUBT_LEAD = 0.5, 1.2  # below these it is not believed any more
-GOAL_WEIGHT = 15.0  # evidence that a goal's pose has, as `Hypothesis.weight`, if it is sure
-GOALS = 3  # poses of it at most
+DOUBTED, DOUBT_LEAD = 0.6, 1.0  # below these it is not believed any more
+GOAL_WEIGHT = 40.0  # evidence that a goal's pose has, as `Hypothesis.weight`, if it is sure
+GOALS, GOAL_SHARE = 3, 0.1  # poses of it at most, each of so much of its picture's evidence
 
 
 class Localiser:
@@ -96,9 +96,11 @@ class Recall:
 
     def begin(self, goals: Sequence[Mode]) -> None:
         """Begin a search, anywhere in the place or elsewhere."""
-        self.localiser, self.goals = Localiser(), list(goals)[:GOALS]
+        self.localiser, self.goals = Localiser(), [
+            goal for goal in goals[:GOALS] if goal.share >= GOAL_SHARE]
         self._pose: np.ndarray | None = None
-        self._suggested: list[tuple[Hypothesis, float] | None] = [None] * len(self.goals)
+        self._frame: np.ndarray | None = None  # of the drive on the robot's map, last believed
+        self._suggested: list[Hypothesis | None] = [None] * len(self.goals)
 
     def look(self, searcher: Searcher, image: torch.Tensor) -> None:
         """Take in a picture [1,3,S,S], and tell the search what is known.
@@ -119,10 +121,14 @@ class Recall:
             return
         own = localiser.poses[0].pose
         frame = compose(searcher.pose, between(own, np.zeros(3)))  # of the drive, on the map
+        if self._frame is not None and not _same(
+                own, compose(between(self._frame, np.zeros(3)), searcher.pose)):
+            self._withdraw(searcher, refuted=True)
+        self._frame = frame
         searcher.grid.prior = self._map(searcher, frame)
         self._suggest(searcher, frame)
 
-    def _map(self, searcher: Searcher, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _map(self, searcher: Searcher, frame: np.ndarray) -> Prior:
         """The map of the drive, laid on the robot's."""
         grid, place = searcher.grid, self.place
         back = between(frame, np.zeros(3))
@@ -133,27 +139,31 @@ class Recall:
         shift = (offset - place.origin) / CELL - 0.5
         matrix = np.array([[c, -s, shift[0]], [s, c, shift[1]]])
         side = grid.seen.shape[::-1]
-        return (cv2.warpAffine(place.log_odds, matrix, side,
-                               flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP),
-                cv2.warpAffine(place.seen, matrix, side,
-                               flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+        return Prior(*(cv2.warpAffine(layer, matrix, side,
+                                      flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+                       for layer in (place.log_odds, place.seen, place.lane)))
 
     def _suggest(self, searcher: Searcher, frame: np.ndarray) -> None:
-        """Say where the goal may be; what looks have refined, or refuted, is left to them."""
-        for k, goal in enumerate(self.goals):
-            pose, said = compose(frame, goal.pose), self._suggested[k]
-            if said is None:
-                own = searcher.hypotheses.suggest(pose, GOAL_WEIGHT * goal.share, goal.precision)
-                self._suggested[k] = own, own.precision
-            elif said[0].precision == said[1]:
-                said[0].pose[:] = pose
+        """Say where the goal may be; looks change what speaks for it, not where it is.
 
-    def _withdraw(self, searcher: Searcher) -> None:
-        """The robot is not where it was thought to be: nor is the goal, if no look says so."""
-        for k, said in enumerate(self._suggested):
-            if said is not None and said[0].precision == said[1] and said[0].refuted == 0:
-                searcher.hypotheses.all = [own for own in searcher.hypotheses.all
-                                           if own is not said[0]]
+        Two pictures of a drive tell that better than the robot sees it on its way.
+        """
+        for k, goal in enumerate(self.goals):
+            own = self._suggested[k]
+            if own is None:
+                own = self._suggested[k] = searcher.hypotheses.suggest(
+                    compose(frame, goal.pose), GOAL_WEIGHT * goal.share, goal.precision)
+            own.pose[:] = compose(frame, goal.pose)
+
+    def _withdraw(self, searcher: Searcher, refuted: bool = False) -> None:
+        """The robot is not where it was thought to be: nor is the goal.
+
+        Where the robot has been in vain it is `refuted`, and stays so, if it may be so after all.
+        """
+        for k, own in enumerate(self._suggested):
+            if own is not None and (refuted or own.refuted == 0):
+                searcher.hypotheses.all = [one for one in searcher.hypotheses.all
+                                           if one is not own]
                 self._suggested[k] = None
 
 

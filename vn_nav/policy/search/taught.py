@@ -26,6 +26,7 @@ class TaughtPlace:
     poses: np.ndarray  # [K,3] float32 x, y [m], yaw [rad] where they were taken
     log_odds: np.ndarray  # [R,C] float32, as of an `OccupancyGrid`
     seen: np.ndarray  # [R,C] float32
+    lane: np.ndarray  # [R,C] float32: 1 where the robot's centre was
     origin: np.ndarray  # [2] float32 m, of the map's lower left corner
 
     def __post_init__(self):
@@ -34,13 +35,14 @@ class TaughtPlace:
                 and self.pictures.shape[:2] == (count, 3)
                 and self.pictures.shape[2] == self.pictures.shape[3]
                 and self.poses.shape == (count, 3) and len(side) == 2
-                and self.seen.shape == side and 1 <= min(side) and max(side) <= MOST_SIDE
+                and self.seen.shape == self.lane.shape == side
+                and 1 <= min(side) and max(side) <= MOST_SIDE
                 and self.origin.shape == (2,))
         if not fits:
             raise UserError('a taught place has key pictures, a pose for each, and a map',
                             ', '.join(f'{field.name} {getattr(self, field.name).shape}'
                                       for field in dataclasses.fields(self)), 'teach it again')
-        for name in ('poses', 'log_odds', 'seen', 'origin'):
+        for name in ('poses', 'log_odds', 'seen', 'lane', 'origin'):
             part = getattr(self, name)
             if part.dtype != np.float32 or not np.isfinite(part).all():
                 raise UserError('numbers of a taught place are finite, of 32 bits',
