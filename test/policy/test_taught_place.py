@@ -158,8 +158,10 @@ def recalled(frame):
 def test_the_recalled_map_lies_where_the_robot_is(frame):
     frame = np.array(frame)
     search, _ = recalled(frame)
-    walls = np.argwhere(search.grid.obstacles())
-    assert len(walls) > 40
+    lane, wall, floor = search.grid.heard_of()
+    assert not search.grid.obstacles().any() and lane.sum() > 50 and floor.sum() > 2000
+    walls = np.argwhere(wall)
+    assert len(walls) > 35
     at = np.column_stack([search.grid.origin + CELL * (walls[:, ::-1] + 0.5),
                           np.zeros(len(walls))])
     on_drive = np.array([between(frame, pose) for pose in at])
@@ -171,41 +173,38 @@ def test_the_recalled_map_lies_where_the_robot_is(frame):
 
 
 def test_what_is_seen_outweighs_what_is_recalled_and_a_lost_robot_believes_its_eyes_alone():
-    search, recall = recalled(np.array([-1.0, -2.0, 0.0]))  # the robot stands at (1, 2)
+    search, _ = recalled(np.array([-1.0, -2.0, 0.0]))  # the robot stands at (1, 2)
     grid = search.grid
-    row, column = grid.cell(2.05, 0.0)  # the wall
-    assert grid.obstacles()[row, column]
+    row, column = grid.cell(2.05, 0.5)  # the wall
+    assert grid.heard_of()[1][row, column]
     ahead = np.zeros((32, 24))
     ahead[:, -1] = 1.0  # free as far as one sees: the wall was taken away
     grid.add_ranges(search.pose, column_bearings(CONFIG.view), ahead, RANGE_EDGES)
-    assert not grid.obstacles()[row, column] and not grid.unknown()[row, column]
-    far = grid.cell(2.05, 1.9)
-    grid.log_odds[far], grid.seen[far] = 3.0, 2.0
-    assert grid.obstacles()[far]
+    assert not np.any([part[row, column] for part in (*grid.heard_of(), grid.unknown())])
     back = grid.cell(-0.5, -1.5)  # behind it: known from the drive alone
     assert not grid.unknown()[back]
     grid.forget_looks()
-    assert grid.unknown()[back] and grid.obstacles()[far]
-    assert isinstance(recall, Recall)
+    assert grid.unknown()[back] and grid.heard_of() is None
 
 
 def test_where_a_robot_has_driven_is_the_cheapest_way_until_something_stands_there():
     search, _ = recalled(np.array([-1.0, -2.0, 0.0]))
     grid, wall = search.grid, search.grid.cell(2.05, 0.0)
-    at, beside, past = grid.cell(1.05, 0.05), grid.cell(1.05, 1.05), grid.cell(3.5, 0.0)
+    lane, beside, past = grid.cell(1.05, 0.05), grid.cell(1.05, 1.05), grid.cell(3.5, 0.0)
     costs = Costmap(grid).cost
-    assert costs[at] == 1 and costs[beside] == costs[past] == 3  # floor that was only seen
-    grid.prior.lane[wall] = 1
-    assert Costmap(grid).passable[wall] and not Costmap(grid).passable[wall[0] + 5, wall[1]]
-    grid.add_contact(np.array([1.85, 0.0, 0.0]), 0.0)
-    assert not Costmap(grid).passable[wall]
+    assert costs[lane] == 1 and costs[beside] == costs[past] == 3.5  # floor that was only seen
+    assert costs[wall] == 31.5
+    grid.add_contact(np.array([0.85, 0.0, 0.0]), 0.0)
+    assert not Costmap(grid).passable[lane]
+    grid.forget_looks()
+    assert Costmap(grid).cost[wall] == 3  # it is unknown floor
 
 
 def test_goals_of_the_drive_are_hypotheses_until_looks_know_better():
     frame = np.array([1.0, 0.5, 0.5])
     search, recall = recalled(frame)
     best, other = search.hypotheses.all
-    assert best.weight == pytest.approx(0.8 * GOAL_WEIGHT) > other.weight
+    assert best.weight == pytest.approx(0.8 * GOAL_WEIGHT) and other.weight < best.weight
     assert apart(best.pose, compose(frame, np.array([2.0, 3.0, 1.0]))) == pytest.approx(
         (0, 0), abs=1e-5)
     assert search.hypotheses.worth_trying(search.rules.follow_from) == [best, other]
@@ -213,7 +212,15 @@ def test_goals_of_the_drive_are_hypotheses_until_looks_know_better():
     recall.keys.said = [([mode(*between(frame, np.zeros(3)))], 0.9)]
     recall.look(search, None)
     assert apart(best.pose, compose(frame, np.array([2.0, 3.0, 1.0])))[0] < 1e-5
+    # It found no way there, and tries again.
+    search.hypotheses.refute(best)
+    recall.keys.said = [([mode(*between(frame, np.zeros(3)))], 0.9)]
+    recall.look(search, None)
+    assert best.refuted == 0 and best.weight == pytest.approx(0.8 * GOAL_WEIGHT)
     # It was there in vain, and is lost: that remains, the other one goes.
+    search.pose = best.pose.copy()
+    recall.keys.said = [([mode(2, 3, 1)], 0.9)]
+    recall.look(search, None)
     search.hypotheses.refute(best)
     for _ in range(12):
         recall.keys.said = [([], 0.01)]

@@ -9,12 +9,14 @@ import cv2
 import numba
 import numpy as np
 
-from vn_nav.policy.search.grid import CELL, KNOWN, OccupancyGrid
+from vn_nav.policy.search.grid import CELL, OccupancyGrid
 
 KEEP = 0.04  # m beyond the footprint that is passable: a cell's edge is half a cell off
 KEEP_OFF = 0.2  # m beyond the footprint within which a way costs more
 CLOSE_COST = 2.0  # of it: this many metres more for a metre, at the footprint
 UNKNOWN_COST = 2.0  # the same for floor that nobody has seen
+ASIDE_COST = 0.5  # where a robot has driven: for a metre beside that
+WALL_COST = 30.0  # for a wall that is known by hearsay
 ROOM = 0.7  # m about a frontier cell in which the unknown floor counts
 HEAD_START = 1.5  # m that all of it unknown is worth
 LEAST_SHARE = 0.12  # of it that makes a frontier
@@ -46,12 +48,14 @@ class Costmap:
         self.passable = (self.clearance > limit) | grid.been
         close = np.clip((limit + KEEP_OFF - self.clearance) / KEEP_OFF, 0, 1)
         price = 1 + CLOSE_COST * close + UNKNOWN_COST * self.unknown
-        lane = grid.lane()
-        if lane is not None:
-            # Where a robot has driven is the surest way; where it has only seen floor, as good as
-            # none: what lies between may be a wall that its eyes missed.
+        heard = grid.heard_of()
+        if heard is not None:
+            # Where a robot has driven is the surest way, surer than what this one sees. Where it has
+            # only seen floor is none: there may be a wall that its eyes missed. Its walls lie a little off, and would close
+            # doors: they cost, and are obstacles when this robot sees them.
+            lane, wall, floor = heard
             self.passable |= lane
-            price = np.where(lane, 1, price + UNKNOWN_COST * ((grid.seen < KNOWN) & ~self.unknown))
+            price = np.where(lane, 1, price + ASIDE_COST + UNKNOWN_COST * floor + WALL_COST * wall)
         self.cost = np.where(self.passable, price, 0).astype(np.float32)
 
     def frontiers(self) -> tuple[np.ndarray, np.ndarray]:

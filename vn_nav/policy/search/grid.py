@@ -130,11 +130,7 @@ class OccupancyGrid:
 
     def obstacles(self) -> np.ndarray:
         """[SIDE,SIDE] bool."""
-        odds = self.log_odds
-        if self.prior is not None and self._prior_counts:
-            own = (self.seen >= KNOWN) | (np.abs(odds) > OCCUPIED)
-            odds = np.where(own, odds, self.prior.log_odds)
-        return ((odds > OCCUPIED) & ~self.stood) | self.contacts
+        return ((self.log_odds > OCCUPIED) & ~self.stood) | self.contacts
 
     def unknown(self) -> np.ndarray:
         """[SIDE,SIDE] bool: hardly seen."""
@@ -143,14 +139,17 @@ class OccupancyGrid:
             seen = seen + self.prior.seen
         return (seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
 
-    def lane(self) -> np.ndarray | None:
-        """[SIDE,SIDE] bool: the prior says that a robot has driven here; None: there is no prior.
+    def heard_of(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """What the prior says, [SIDE,SIDE] bool: where a robot drove, walls, floor that was seen.
 
-        Nothing that this robot has seen, or touched, speaks against it.
+        The last two where this robot has seen nothing itself. None: there is no prior.
         """
         if self.prior is None or not self._prior_counts:
             return None
-        return (self.prior.lane > 0.5) & (self.log_odds <= OCCUPIED) & ~self.contacts
+        lane = (self.prior.lane > 0.5) & (self.log_odds <= OCCUPIED) & ~self.contacts
+        other = (self.seen < KNOWN) & ~self.stood & ~self.contacts & (self.log_odds <= OCCUPIED)
+        wall = other & ~lane & (self.prior.log_odds > OCCUPIED)
+        return lane, wall, other & ~lane & ~wall & (self.prior.seen >= KNOWN)
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """Row and column of a place; outside, of the nearest cell."""

@@ -16,7 +16,7 @@ import torch
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.pose_graph import between, compose
 from vn_nav.policy.search.grid import CELL, Prior
-from vn_nav.policy.search.hypotheses import Hypothesis, apart
+from vn_nav.policy.search.hypotheses import MERGE_M, MERGE_RAD, Hypothesis, apart
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
 from vn_nav.policy.search.searcher import Searcher
 from vn_nav.policy.search.taught import TaughtPlace
@@ -30,6 +30,8 @@ FORGET = 0.05  # weight under which a pose is dropped
 SURE, LEAD = 1.2, 2.0  # weight, and times that of the next pose, from which on a pose is believed
 DOUBTED, DOUBT_LEAD = 0.6, 1.0  # below these it is not believed any more
 GOAL_WEIGHT = 40.0  # evidence that a goal's pose has, as `Hypothesis.weight`, if it is sure
+# A goal that the robot was not nearer to than this is tried again, so many times.
+TRIED_M, TRIES = 1.0, 3
 GOALS, GOAL_SHARE = 3, 0.1  # poses of it at most, each of so much of its picture's evidence
 
 
@@ -96,10 +98,16 @@ class Recall:
 
     def begin(self, goals: Sequence[Mode]) -> None:
         """Begin a search, anywhere in the place or elsewhere."""
-        self.localiser, self.goals = Localiser(), [
-            goal for goal in goals[:GOALS] if goal.share >= GOAL_SHARE]
+        self.localiser = Localiser()
+        self.goals: list[Mode] = []
+        for goal in goals[:GOALS]:
+            gaps = [apart(goal.pose, own.pose) for own in self.goals]
+            if goal.share >= GOAL_SHARE and not any(
+                    gap < MERGE_M and turn < MERGE_RAD for gap, turn in gaps):
+                self.goals.append(goal)  # nearer ones would be one hypothesis
         self._pose: np.ndarray | None = None
         self._frame: np.ndarray | None = None  # of the drive on the robot's map, last believed
+        self._tries = [TRIES] * len(self.goals)
         self._suggested: list[Hypothesis | None] = [None] * len(self.goals)
 
     def look(self, searcher: Searcher, image: torch.Tensor) -> None:
@@ -154,6 +162,10 @@ class Recall:
                 own = self._suggested[k] = searcher.hypotheses.suggest(
                     compose(frame, goal.pose), GOAL_WEIGHT * goal.share, goal.precision)
             own.pose[:] = compose(frame, goal.pose)
+            if own.refuted and self._tries[k] and apart(own.pose, searcher.pose)[0] > TRIED_M:
+                # It did not get there: that says nothing of the goal.
+                self._tries[k] -= 1
+                own.refuted, own.weight = 0, GOAL_WEIGHT * goal.share
 
     def _withdraw(self, searcher: Searcher, refuted: bool = False) -> None:
         """The robot is not where it was thought to be: nor is the goal.
