@@ -255,6 +255,7 @@ def test_a_taught_checkpoint_comes_back(tmp_path):
     for field in dataclasses.fields(TaughtPlace):
         assert np.array_equal(getattr(loaded.network.taught, field.name),
                               getattr(policy.taught, field.name))
+    assert 'map of that drive' in (tmp_path / 'model' / 'README.md').read_text()
     save_checkpoint(tmp_path / 'model', network(), INFO)  # replaced by one that was taught nothing
     assert load_checkpoint(tmp_path / 'model').network.taught is None
     assert sorted(path.name for path in (tmp_path / 'model').iterdir()) == [

@@ -21,7 +21,7 @@ MOST_KEYS = 400  # beyond, key pictures are chosen farther apart
 WIDER = 1.1  # times, until they are few enough
 PLAIN = 8.0  # grey levels: a picture that varies less tells no place
 BATCH = 64  # pictures
-LANE_M = 0.1  # about where the robot's centre was: pictures along a drive are that far apart
+LANE_M = 0.15  # about where the robot's centre was: steps of a robot are not the joystick's
 
 
 def choose_keys(pictures: np.ndarray, poses: np.ndarray) -> np.ndarray:
