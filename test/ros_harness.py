@@ -12,8 +12,8 @@ import torch
 
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.checkpoint import save_checkpoint
-from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import DRIVE_ACTIONS
 from vn_sim_bridge.simulators.house import WORLD_VERSION
 
@@ -26,7 +26,7 @@ def write_checkpoint(folder, size=84, seed=0, *, arrival=None, stop_threshold=No
     With `arrival` it has that head, which says this probability of whatever it sees.
     """
     torch.manual_seed(seed)
-    network = Policy(NetworkConfig(**{
+    network = build_policy(NetworkConfig(**{
         'actions': DRIVE_ACTIONS, 'size': size, 'channels': (4, 4, 4), 'features': 16,
         'hidden': 16, 'heads': () if arrival is None else ('arrival',), **fields}))
     if arrival is not None:

@@ -23,6 +23,7 @@ class Topic:
     reliability: str = RELIABLE
     durability: str = VOLATILE
     depth: int = 10
+    debug: bool = False  # to be looked at: recorded only where it is named
 
 
 def _sensor(name, kind, publisher, meaning):
@@ -61,6 +62,13 @@ TOPICS = (
     _latched('arrived', 'std_msgs/msg/Bool', 'policy',
              'true: it declares arrival and stands still; false: it does not, published '
              'again for every goal'),
+    dataclasses.replace(_latched(
+        'policy_node/map', 'nav_msgs/msg/OccupancyGrid', 'policy',
+        'debug: the map of a policy that searches, 0 free to 100 occupied, -1 unknown; once a '
+        'second at most, when somebody listens'), debug=True),
+    dataclasses.replace(_latched(
+        'policy_node/hypotheses', 'geometry_msgs/msg/PoseArray', 'policy',
+        'debug: where it takes the goal to be, the likeliest first; as the map'), debug=True),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'policy, bridge',
           'state and reasons'),
     _sensor('depth/image_raw', _IMAGE, 'bridge', '32FC1 metres, exact'),

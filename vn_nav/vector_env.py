@@ -125,7 +125,21 @@ class MeasuredVectorEnv(NavigationVectorEnv, Protocol):
     single_action_space: Any
 
     def set_shown_goal(self, mode: str) -> None:
-        """Which picture later episodes show: 'right', 'wrong' or 'blank'."""
+        """Which picture later episodes show: 'right', 'wrong', 'absent' or 'blank'."""
 
     def oracle_actions(self) -> Any:
         """[N] the next actions on shortest paths."""
+
+
+@runtime_checkable
+class ExploringEnv(Protocol):
+    """Has a robot that explores, knowing all that it has seen, to compare others with.
+
+    `info` then also has `shown_other` [N] bool, where another picture than the goal's is shown,
+    and `at_shown` [N] bool, where the robot stands at that picture's place.
+    """
+
+    explores: bool  # whether it does here
+
+    def explorer_actions(self) -> Any:
+        """[N] the next actions of it; to be asked at every observation."""

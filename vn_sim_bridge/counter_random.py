@@ -38,6 +38,7 @@ class Stream(enum.IntEnum):
     VIEW_APPEARANCE = 21
     EPISODE_ODOMETRY = 22  # errors of odometry, of a decision; ODOMETRY: of a tick
     PAIR_LENS = 23
+    RANGES = 24  # noise of measured ranges
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

@@ -11,7 +11,8 @@ from vn_nav.errors import UserError
 from vn_nav.policy.search.look import COLUMNS, column_bearings
 from vn_nav.scenes import house_scenes
 from vn_sim_bridge.datasets.view_pairs import PairSampler
-from vn_sim_bridge.datasets.view_ranges import ranges_of_depth, ray_cast
+from vn_sim_bridge.datasets.view_ranges import ranges_of_depth
+from vn_sim_bridge.floor.rays import ray_cast
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.simulator import cameras_at
 
@@ -79,7 +80,8 @@ def test_ranges_between_known_walls():
     rects = np.array([[2.0, -9, 2.2, 9], [-9, 1.0, 9, 1.1], [0, 0, 1, 1]])
     poses = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, math.pi / 2, 0.0]])
     ahead_and_left = np.array([0.0, math.pi / 4, math.pi / 2, math.pi])
-    found = ray_cast(poses, np.array([0, 0]), ahead_and_left, rects, np.array([0, 2, 3]))
+    bearings = np.stack([ahead_and_left, ahead_and_left])
+    found = ray_cast(poses, np.array([0, 0]), bearings, rects, np.array([0, 2, 3]))
     assert np.allclose(found[0], [2.0, math.sqrt(2), 1.0, np.inf], atol=1e-6)
     assert np.allclose(found[1], [1.0, math.sqrt(2), np.inf, np.inf], atol=1e-6)
 
@@ -94,13 +96,14 @@ def test_depth_gives_the_ranges_that_walls_give(pitch):
     plain.count = 0
     pairs = plain.draw(40)
     poses = np.stack([pairs['goal_place'], pairs['pose']], 1).reshape(-1, 4)
-    found = ranges_of_depth(groups['depth'], *cameras_at(poses, robot), poses[:, 2], BEARINGS)
+    lens = (*cameras_at(poses, robot), poses[:, 2], np.tile(BEARINGS, (len(poses), 1)))
+    found = ranges_of_depth(groups['depth'], *lens)
     known = np.isfinite(found)
     assert known.mean() > 0.98
     # A table stands over what is behind its edge, a door is edged: most columns agree.
     assert (np.abs(found - groups['ranges'])[known] < 0.1 * groups['ranges'][known] + 0.05
             ).mean() > 0.8
-    blind = ranges_of_depth(0 * groups['depth'], *cameras_at(poses, robot), poses[:, 2], BEARINGS)
+    blind = ranges_of_depth(0 * groups['depth'], *lens)
     assert np.isnan(blind).all()
 
 

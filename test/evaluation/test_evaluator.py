@@ -1,11 +1,13 @@
 """Episodes of a policy and its controls, by kind of stop and by house, and the page about them."""
 
 import functools
+import math
 
 import numpy as np
 import pytest
 import torch
 
+from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import (
     PolicyActor,
     by_scene,
@@ -16,6 +18,7 @@ from vn_nav.evaluation.evaluator import (
     split_figures,
 )
 from vn_nav.evaluation.metrics import Episode
+from vn_nav.observation import needed_side
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.report import tables
@@ -25,7 +28,7 @@ from vn_sim_bridge.navigation.env import NavigationEnv
 from vn_sim_bridge.navigation.env_config import EnvConfig
 
 ROWS = ['right goal, sample', 'right goal, greedy', 'wrong goal', 'blank goal', 'random actions',
-        'shortest path']
+        'explorer', 'shortest path']
 
 
 def make_network(**fields):
@@ -78,6 +81,8 @@ def test_every_control_and_equal_starts():
     assert list(rows) == ['arrival'] and list(rows['arrival']) == ROWS
     found = figures(rows)['arrival']
     assert found['shortest path']['success'] >= 0.9
+    assert found['explorer']['success'] >= 0.6 > found['random actions']['success']
+    assert found['explorer']['spl'] < found['shortest path']['spl']
     starts = {tuple(e.start_distance for e in episodes) for episodes in rows['arrival'].values()}
     assert len(starts) == 1
 
@@ -164,6 +169,52 @@ def test_a_declared_stop_is_measured_beside_arrival():
     assert never['decisions'] == 40
 
 
+def test_whatever_is_declared_of_an_absent_goal_is_false():
+    network = make_network(heads=('arrival',))
+    rows = measure(make_env, network, ['house:7', 'house:8'], decoding='sample', episodes=6,
+                   controls=('absent goal', 'wrong goal', 'shortest path'), threshold=0.0)
+    assert 'absent goal' not in rows['arrival'] and 'wrong goal' in rows['arrival']
+    assert list(rows['declared']) == ['right goal, sample', 'wrong goal', 'absent goal',
+                                      'shortest path']
+    found = figures(rows)['declared']
+    assert found['absent goal']['declared'] == found['absent goal']['false_stops'] == 1.0
+    assert found['absent goal']['stops_at_shown'] == 0.0
+    assert 'stops_at_shown' not in found['right goal, sample']
+    assert 'at the picture' in tables.rows_html(found, 'declared')
+    assert found['shortest path']['within_1m'] >= found['shortest path']['success']
+
+
+def test_one_kind_of_stop_or_the_controls_alone():
+    network = make_network(heads=('arrival',))
+    rows = measure(functools.partial(make_env, limit=5), network, ['house:7'], decoding='sample',
+                   episodes=2, controls=('random actions',), stops=('declared',), own=False)
+    assert {stop: list(own) for stop, own in rows.items()} == {'declared': ['random actions']}
+    with pytest.raises(UserError, match='arrival'):
+        measure(make_env, make_network(), ['house:7'], decoding='sample', stops=('declared',))
+
+
+def test_a_wider_camera_shows_the_network_what_its_own_would():
+    """As over ROS: cropped to the field of view of the training."""
+    size, own = 36, math.radians(90)
+    wide = RobotSpec(camera_fov=math.radians(110))
+    side = needed_side(size, wide.camera_fov, own)
+    env, usual = (NavigationEnv(EnvConfig(scenes=('house:7',), num_envs=4, size=pixels), robot)
+                  for pixels, robot in ((side, wide), (size, RobotSpec())))
+    network = make_network()
+    actor = PolicyActor(env, network, 'greedy', 0, camera_fov=own)
+    observation, info = env.reset(seed=0)
+    same, _ = usual.reset(seed=0)
+    cropped = actor._own(observation['image'])
+    assert side > size and cropped.shape == same['image'].shape
+
+    def off(one, other):
+        return np.abs(one.astype(float) - other).mean()
+    assert off(cropped, same['image']) < 0.4 * off(cropped, same['image'][[1, 2, 3, 0]])
+    seen = PolicyActor(usual, network, 'greedy', 0, camera_fov=own)
+    assert seen._own(same['image']) is same['image']
+    assert actor(observation, info['reset']).shape == (4,)  # goals are cropped as well
+
+
 def test_the_policy_declares_where_its_head_says_so():
     env = make_env(stop='declared')
     actor = PolicyActor(env, make_network(heads=('arrival',)), 'sample', 0, threshold=0.5)
@@ -181,6 +232,7 @@ def result_and_rows(stop_threshold=0.0, scenes=('house:7', 'house:8')):
                    episodes=8, controls=('wrong goal', 'random actions'), threshold=stop_threshold)
     return {'checkpoint': 'a <b> run', 'simulator': 'house', 'world_version': '2', 'task': 'image',
             'decoding': 'sample', 'max_decisions': 40, 'seed': 0, 'odometry': 'drift',
+            'camera': '90 deg, 1 m high',
             'date': '2026-11-24', 'splits': {'scenes': split_figures(rows, scenes)}
             }, {'scenes': rows}
 

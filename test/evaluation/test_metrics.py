@@ -77,6 +77,26 @@ def test_declared_stops_are_counted_and_never_mixed_with_arrival():
         summarise([right, episode()])
 
 
+def test_habitats_rule_asks_for_a_metre_whatever_the_heading():
+    there = episode(declared=True, reached=True, path_length=9.2)  # of a start 4.6 m away
+    turned = episode(declared=True, success=False, stop_distance=0.9, stop_heading=3.0)
+    away = episode(declared=True, success=False, stop_distance=1.1)
+    silent = episode(declared=False, success=False, reached=True)
+    figures = summarise([there, turned, away, silent])
+    assert figures['success'] == 0.25 and figures['within_1m'] == 0.5
+    assert figures['spl_within_1m'] == pytest.approx((4.6 / 9.2 + 4.6 / 8) / 4)
+    assert summarise([episode(declared=True, unit='steps')])['within_1m'] is None
+    assert 'within_1m' not in summarise([episode()])
+
+
+def test_stops_at_a_shown_picture_are_counted_where_another_was_shown():
+    at = episode(declared=True, success=False, at_shown=True)
+    passing = episode(declared=False, success=False, at_shown=True)
+    figures = summarise([at, passing, episode(declared=True, success=False, at_shown=False)])
+    assert figures['stops_at_shown'] == pytest.approx(1 / 3)
+    assert 'stops_at_shown' not in summarise([episode(declared=True)])
+
+
 def test_bootstrap_interval_narrows_with_episodes():
     few, many = (bootstrap_interval([0, 1] * n) for n in (10, 400))
     assert few[1] - few[0] > 3 * (many[1] - many[0])

@@ -77,7 +77,8 @@ def said(count, **parts):
 
 def truth(count, overlap=1.0, arrived=True):
     return {'goal_pose': np.tile(np.float32([1, 0, 1, 0]), (count, 1)),
-            'overlap': np.full(count, overlap, np.float32), 'arrived': np.full(count, arrived)}
+            'overlap': np.full(count, overlap, np.float32), 'arrived': np.full(count, arrived),
+            'zoom': np.ones(count, np.float32)}
 
 
 def test_the_losses_are_those_of_distributions():
@@ -103,6 +104,9 @@ def test_what_is_not_known_teaches_nothing():
     some['overlap'][1] = -1.0
     logits = torch.tensor([3.0, 50.0])
     assert recognition_losses(said(2, co_visible=logits), some)['co_visible'] < 0.1
+    some['zoom'][1] = 1.5  # through another lens arrival follows from the pose
+    some['arrived'][1] = False
+    assert recognition_losses(said(2, arrived=logits), some)['arrived'] < 0.1
     flat = torch.full((1, COLUMNS, BINS), -math.log(BINS))
     ranges = np.full((1, COLUMNS), np.nan, np.float32)
     assert range_loss(flat, ranges) == 0

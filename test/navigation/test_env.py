@@ -1,12 +1,14 @@
 """NavigationEnv: what training and evaluation rely on."""
 
+import math
+
 import numpy as np
 import pytest
 from small_env import make, random_actions
 
 from vn_nav.errors import UserError
 from vn_nav.scenes import house_scenes
-from vn_nav.vector_env import MeasuredVectorEnv, NavigationVectorEnv
+from vn_nav.vector_env import ExploringEnv, MeasuredVectorEnv, NavigationVectorEnv
 from vn_sim_bridge.navigation.tasks import ARRIVAL_HEADING, ARRIVAL_RADIUS
 
 
@@ -23,6 +25,7 @@ def test_observations_lie_in_their_space():
 def test_it_is_what_trainer_and_evaluator_use():
     env = make()
     assert isinstance(env, MeasuredVectorEnv) and isinstance(env, NavigationVectorEnv)
+    assert isinstance(env, ExploringEnv) and env.explores
     _, info = env.reset(seed=0)
     assert {'reset', 'success', 'collided', 'arrived', 'distance', 'heading_error',
             'start_distance', 'path_length', 'decisions', 'goal', 'pose'} <= info.keys()
@@ -119,6 +122,37 @@ def test_wrong_and_blank_goals_change_the_picture_not_the_task():
     blank, _ = env.reset(seed=0)
     assert (blank['goal_index'] == env.blank_goal).all()
     assert len(np.unique(env.goals[env.blank_goal])) == 1
+
+
+def test_an_absent_goal_is_a_picture_of_another_place():
+    env = make(num_envs=12, scenes=('house:3', 'house:4', 'house:5'))
+    right, info = env.reset(seed=0)
+    assert not info['shown_other'].any() and not info['at_shown'].any()
+    env.set_shown_goal('absent')
+    absent, absent_info = env.reset(seed=0)
+    assert np.array_equal(info['goal'], absent_info['goal'])
+    assert np.array_equal(info['pose'], absent_info['pose'])
+    places = np.array([view.place for view in env.task.views])
+    assert (places[absent['goal_index']] != env.place_index).all()
+    assert (places[right['goal_index']] == env.place_index).all()
+    assert len(set(absent['goal_index'].tolist())) > 4 and absent_info['shown_other'].all()
+    # Where it would be in its own place is nowhere here.
+    env.simulator.place(np.arange(12), env.goal_poses[absent['goal_index']])
+    assert not env.step(np.full(12, 1))[4]['at_shown'].any()
+    with pytest.raises(UserError, match='two places'):
+        make(num_envs=2).set_shown_goal('absent')
+
+
+def test_standing_at_the_wrong_picture_is_told():
+    env = make(num_envs=16, noise=False)
+    env.set_shown_goal('wrong')
+    observation, info = env.reset(seed=0)
+    assert info['shown_other'].all()
+    beside = env.goal_poses[observation['goal_index']].copy()
+    beside[8:, 2] += math.radians(90)  # half of them look elsewhere
+    env.simulator.place(np.arange(16), beside)
+    told = env.step(np.full(16, env.action_names.index('forward')))[4]['at_shown']
+    assert told[:8].all() and not told[8:].any()
 
 
 def test_a_robot_that_sees_its_goal_pose_sees_the_goal_picture():

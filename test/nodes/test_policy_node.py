@@ -1,5 +1,6 @@
 """policy_node as a real process, driven over real ROS topics by a robot of this process."""
 
+import math
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 from vn_nav.errors import UserError
 from vn_nav.nodes.qos import qos
 from vn_nav.policy.runtime import PolicyRuntime
-from vn_nav.robot import RobotSpec
+from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 
 pytestmark = pytest.mark.ros
 
@@ -152,6 +153,28 @@ def test_a_second_publisher_and_a_narrow_camera_are_refused(robot, checkpoint, t
         robot.says('other publisher')
         robot.wait_for_zero()
         robot.node.destroy_publisher(intruder)
+
+
+def test_a_policy_that_searches_drives_by_a_narrow_wide_format_camera(tmp_path):
+    spec = RobotSpec().with_actions(DRIVE_ACTIONS)
+    checkpoint = write_checkpoint(
+        tmp_path / 'search', 48, architecture='search', channels=(8, 12, 8), blocks=1,
+        moves=spec.moves, view=spec.camera_fov, footprint=spec.footprint_radius)
+    rclpy.init()
+    robot = FakeRobot((160, 90))
+    try:
+        with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=checkpoint):
+            robot.focal = 80 / math.tan(math.radians(20))  # 40 deg across
+            robot.show_goal()
+            wait_until(lambda: 'horizontally' in robot.refusal(), robot.spin)
+            robot.focal = 80 / math.tan(math.radians(30))
+            robot.enable()
+            wait_until(robot.moving, robot.spin)
+            *_, values = robot.statuses[-1]
+            assert float(values['camera_fov_deg']) == pytest.approx(36.0, abs=0.1)  # upright
+    finally:
+        robot.close()
+        rclpy.shutdown()
 
 
 @pytest.mark.parametrize('parameters, word', [

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from vn_nav.measured_ranges import Scan, Scanner, laser_scan
 from vn_nav.policy.search.costmap import Costmap
-from vn_nav.policy.search.grid import CELL, SIDE, OccupancyGrid
+from vn_nav.policy.search.grid import CELL, SIDE, OccupancyGrid, on_robot
 from vn_nav.policy.search.hypotheses import Hypotheses, apart, on_map
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, column_bearings
 from vn_nav.policy.search.searcher import Searcher, Sight
@@ -269,3 +270,101 @@ def test_the_same_looks_make_the_same_decisions():
             actions.append(last)
         return actions
     assert drive() == drive()
+
+
+def scanned(pose, half=2.0, ray=1.0, mount=(0.0, 0.0, 0.0), **changes):
+    """A laser scan [deg of a ray] in a square room about the origin, from a robot's pose [3]."""
+    at = on_robot(pose, mount)
+    bearings = -math.pi + np.radians(ray) * np.arange(round(360 / ray))
+    angles = at[2] + bearings
+    with np.errstate(divide='ignore', invalid='ignore'):
+        x = (np.sign(np.cos(angles)) * half - at[0]) / np.cos(angles)
+        y = (np.sign(np.sin(angles)) * half - at[1]) / np.sin(angles)
+    return laser_scan(np.fmin(np.abs(x), np.abs(y)), -math.pi, math.radians(ray), 0.1, 12.0,
+                      mount)
+
+
+def ring(grid, half=2.0):
+    """Cells [K,2] of the walls of the square room."""
+    along = np.arange(-half + 0.05, half, CELL)
+    return [grid.cell(*place) for a in along for place in (
+        (half + 0.03, a), (-half - 0.03, a), (a, half + 0.03), (a, -half - 0.03))]
+
+
+@pytest.mark.parametrize('mount', [(0.0, 0.0, 0.0), (0.15, -0.1, math.pi), (-0.2, 0.0, 0.7)])
+def test_a_scan_is_certain_all_around_wherever_the_sensor_sits(mount):
+    grid, pose = OccupancyGrid(0.18), np.array([0.3, -0.4, 0.5])
+    grid.add_scan(pose, scanned(pose, half=2.03, mount=mount), BEARINGS)
+    assert np.mean([grid.obstacles()[cell] for cell in ring(grid)]) > 0.9  # one look
+    within = np.arange(-1.7, 1.8, 0.2)
+    inside = [grid.cell(x, y) for x in within for y in within]
+    assert all(grid.measured[cell] and not grid.obstacles()[cell] for cell in inside)
+    assert not grid.measured[grid.cell(2.6, 0.0)] and grid.uncharted()[grid.cell(2.6, 0.0)]
+
+
+def test_a_scan_shows_where_something_stands_and_the_camera_alone_has_looked():
+    grid, pose = OccupancyGrid(0.18), np.zeros(3)
+    grid.add_scan(pose, scanned(pose, half=2.03), BEARINGS)
+    ahead, behind = grid.cell(1.0, 0.0), grid.cell(-1.0, 0.0)
+    assert not grid.unknown()[ahead] and grid.unknown()[behind]
+    assert not grid.uncharted()[behind]  # it may drive there all the same
+    costmap = Costmap(grid)
+    assert costmap.passable[behind] and costmap.cost[behind] == costmap.cost[ahead] == 1
+    back = grid.look_gains(pose, np.array([0.0, math.pi]), BEARINGS)
+    assert back[0] < 0.1 < 2.0 < back[1]
+    field = costmap.cost_to_go(np.array([behind]), np.zeros(1), grid.cell(0.0, 0.0),
+                               through_unknown=False)
+    assert field[grid.cell(0.0, 0.0)] == pytest.approx(1.0, abs=0.15)
+    for yaw in np.arange(1, 12) * math.pi / 6:  # a full turn, and everything is looked at
+        turned = np.array([0.0, 0.0, yaw])
+        grid.add_scan(turned, scanned(turned, half=2.03), BEARINGS)
+    assert not any(grid.unknown()[cell] for cell in (ahead, behind))
+    assert len(Costmap(grid).frontiers()[0]) == 0
+
+
+def test_infinity_is_free_floor_less_than_the_least_range_is_not_and_nan_says_nothing():
+    nan, inf = math.nan, math.inf
+    for value, free, hit in ((inf, 5.9, None), (-inf, None, 0.3), (nan, None, None),
+                             (3.0, 2.8, 3.0), (7.0, 5.9, None)):
+        grid = OccupancyGrid(0.18)
+        grid.add_scan(np.zeros(3), laser_scan([value] * 41, -0.1, 0.005, 0.3, 12.0), BEARINGS)
+        reach = grid.measured[grid.cell(0.0, 0.05)[0]]
+        x = grid.origin[0] + CELL * (np.flatnonzero(reach) + 0.5)
+        ends = [place for place in x if grid.obstacles()[grid.cell(place, 0.05)]]
+        clear = [place for place in x if grid.log_odds[grid.cell(place, 0.05)] < 0]
+        assert (max(clear, default=None) is None) == (free is None)
+        assert free is None or max(clear) == pytest.approx(free, abs=0.15)
+        assert (not ends) == (hit is None)
+        assert hit is None or ends[0] == pytest.approx(hit, abs=0.1)
+    own = searcher()  # a scan that says nothing is as good as none: the picture's ranges count
+    own.step(sight(), -1, None, scan=laser_scan([nan] * 41, -0.1, 0.005, 0.3, 12.0))
+    assert not own.grid.measured.any() and own.grid.log_odds.any()
+
+
+def test_a_depth_camera_does_not_clear_what_it_looks_over():
+    grid = OccupancyGrid(0.18)
+    grid.log_odds[grid.cell(0.5, 0.0)] = 2.0  # a stool
+    grid.log_odds[grid.cell(1.5, 0.0)] = 2.0
+    scanner = Scanner(BEARINGS[::-1], 0.0, 8.0, clear_from=0.85)
+    for _ in range(3):
+        grid.add_scan(np.zeros(3), Scan(scanner, wall_ahead(3.0)[::-1].astype(np.float32)),
+                      BEARINGS)
+    assert grid.obstacles()[grid.cell(0.5, 0.0)] and not grid.obstacles()[grid.cell(1.5, 0.0)]
+    assert not grid.uncharted()[grid.cell(0.3, 0.1)]
+
+
+def test_with_a_scan_it_drives_round_what_the_pictures_do_not_show():
+    def contacts(with_scan):
+        own, pose, last, met = searcher(), np.array([-1.0, 0.0, 0.0]), -1, 0
+        for _ in range(40):  # the pictures say that all is free
+            relative = np.array([pose[0] + 1.0, pose[1], pose[2]])
+            last = own.step(sight(ranges=one_hot(np.full(COLUMNS, 6.0))), last, relative,
+                            scan=scanned(pose) if with_scan else None)
+            move = MOVES[last]
+            moved = pose + [math.cos(pose[2]) * move[0], math.sin(pose[2]) * move[0], move[2]]
+            if np.abs(moved[:2]).max() > 2.0 - 0.25:
+                met += 1
+            else:
+                pose = moved
+        return met
+    assert contacts(with_scan=True) == 0 < contacts(with_scan=False)

@@ -24,7 +24,7 @@ from vn_nav.cli.world import (
 )
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
-from vn_nav.evaluation.measurement import EvaluateConfig, evaluate, odometry_for
+from vn_nav.evaluation.measurement import EvaluateConfig, evaluate, odometry_for, ranges_for
 from vn_nav.files import write_file
 from vn_nav.learning.teach_evaluation import DRIVE_SPLITS
 from vn_nav.report import tables
@@ -62,6 +62,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help='that a policy which uses odometry is given: what really happened, '
                         'that with the errors of a good base, or the moves as commanded (default: '
                         'drift; none for other policies)')
+    parser.add_argument('--ranges', choices=('picture', 'scan', 'depth'),
+                        help='that the map of a policy which searches is given: what its network '
+                        'sees in the picture, a laser scan all around, or a depth picture '
+                        '(default: picture)')
+    parser.add_argument('--stop', choices=evaluator.STOPS, help='what ends the episodes: '
+                        'arriving, or that the policy says so (default: both, apart)')
     parser.add_argument('--no-controls', action='store_true')
     parser.add_argument('--per-scene', action='store_true', help='print each scene as well')
     parser.add_argument('--json', type=Path, metavar='FILE', help='also write the figures here')
@@ -76,15 +82,20 @@ def run(args: argparse.Namespace) -> int:
     config = EvaluateConfig(
         episodes=args.episodes, seed=args.seed, decoding=args.decoding,
         controls=() if args.no_controls else evaluator.CONTROLS,
-        stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None)
-    checkpoint, robot = load_for(args.checkpoint, args.robot)
+        stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None,
+        stops=(args.stop,) if args.stop else evaluator.STOPS)
+    # Pictures of a drive were taken with its own camera.
+    checkpoint, robot = load_for(args.checkpoint, args.robot, any_camera=args.bag is None)
     odometry = odometry_for(checkpoint.network, args.odometry)
+    ranges = ranges_for(checkpoint.network, args.ranges)
+    measured_by = '' if ranges == 'picture' else f', ranges: {ranges}'
     bag = args.bag.name if args.bag else None
 
     def show(name: str, result: dict) -> None:
         split = result['splits'][name]
+        camera = f', camera {result["camera"]}' if args.robot else ''
         title = (f'{args.checkpoint}, {tables.place(name, list(split["scenes"]), bag)}, '
-                 f'{args.max_decisions} decisions at most')
+                 f'{args.max_decisions} decisions at most{camera}{measured_by}')
         tables.print_rows(split['rows'], title)
         if args.per_scene and not args.bag:
             tables.print_scenes(split['scenes'], title)
@@ -134,6 +145,9 @@ def _check_drive(args: argparse.Namespace) -> None:
         if getattr(args, name) is not None:
             raise UserError('a recorded drive has pictures and a size of its own',
                             f'--{name} together with --bag', 'leave one of them out')
+    if args.ranges not in (None, 'picture'):
+        raise UserError('nobody measures ranges in the pictures of a recorded drive',
+                        f'--ranges {args.ranges} together with --bag', 'leave one of them out')
     for name in args.split or ():
         if name not in DRIVE_SPLITS:
             raise UserError(f'goals of a drive are divided into {" and ".join(DRIVE_SPLITS)}',
@@ -192,7 +206,8 @@ def _scenes(args: argparse.Namespace, checkpoint, odometry: str) -> tuple[dict, 
             checkpoint, names, environments, stop=stop, robot=args.robot,
             own=set(splits[split]) <= set(checkpoint.info['scenes']),
             randomisation=args.randomisation, max_decisions=args.max_decisions,
-            goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0, odometry=odometry, say=say)
+            goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0, odometry=odometry,
+            ranges=args.ranges, say=say)
     return splits, make
 
 

@@ -90,6 +90,7 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
 def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
                  max_decisions: int = 300, goal_seed: int = 0, odometry: str | None = None,
+                 ranges: str | None = None,
                  say: Callable[[str], None] = SAY):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
 
@@ -102,20 +103,28 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         max_decisions: of an episode.
         goal_seed: 0 for the goals of the training.
         odometry: that the policy is given; None: see `measurement.odometry_for`.
+        ranges: that its map is given; None: see `measurement.ranges_for`.
         say: receives a line about what the simulator cannot vary.
 
     Raises:
         UserError: the checkpoint belongs to another version of the simulator; the policy uses no
             odometry.
     """
-    from vn_nav.evaluation.measurement import odometry_for
+    from vn_nav.evaluation.measurement import odometry_for, ranges_for
+    from vn_nav.observation import needed_side
+    from vn_nav.robot import load_robot
     info = checkpoint.info
-    env = make_env(scenes, envs, robot=robot, size=checkpoint.config.size,
+    size = checkpoint.config.size
+    if robot is not None:  # which may have another camera: see `PolicyActor`
+        size = needed_side(size, load_robot(robot).camera_fov,
+                           math.radians(info['camera_fov_deg']))
+    env = make_env(scenes, envs, robot=robot, size=size,
                    randomisation=randomisation or info['randomisation'], task=info['task'],
                    objects=info['objects'], actions=checkpoint.config.actions,
                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
                    goals_per_room=info['goals_per_room'] if own else 1,
                    odometry=odometry_for(checkpoint.network, odometry),
+                   ranges=ranges_for(checkpoint.network, ranges),
                    may_lack=() if randomisation else ('randomisation',), say=say)
     try:
         check_version(info, simulator=env.simulator_name, version=env.world_version)
@@ -154,8 +163,13 @@ def machine(device: str = 'cpu') -> str:
     return f'{model}, {os.cpu_count()} cores'
 
 
-def load_for(path: Path, robot: Path | None = None):
+def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False):
     """A checkpoint, and the robot with its actions.
+
+    Args:
+        path: of the checkpoint.
+        robot: file of the robot; None: the one that it was trained for.
+        any_camera: a robot file may have another camera than the policy was trained with.
 
     Raises:
         UserError: the robot has other actions or another camera.
@@ -168,7 +182,8 @@ def load_for(path: Path, robot: Path | None = None):
     spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
     present = math.degrees(spec.camera_fov), spec.camera_height
-    if any(abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
+    if not (any_camera and robot) and any(
+            abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
         raise UserError('the robot has the camera that the policy was trained with: '
                         f'{trained[0]:g} deg, {trained[1]:g} m high',
                         f'{present[0]:g} deg, {present[1]:g} m (robot {spec.name})',

@@ -7,23 +7,30 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from vn_nav.errors import UserError
 from vn_nav.evaluation.metrics import Episode, summarise
+from vn_nav.observation import preprocess
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.policy.search.lens import zoom_of
+from vn_nav.policy.search.snapshot import Snapshot, snapshot
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
-from vn_nav.vector_env import MeasuredVectorEnv
+from vn_nav.vector_env import ExploringEnv, MeasuredVectorEnv
 
 Actor = Callable[[dict, np.ndarray], np.ndarray]  # (observation, reset [N]) -> actions [N]
 Rows = dict[str, dict[str, list[Episode]]]  # 'arrival' or 'declared', then a row's name
 ARRIVAL, DECLARED = 'arrival', 'declared'  # what ends an episode before its limit
-OTHER, WRONG, BLANK, RANDOM, SHORTEST = (
-    'other decoding', 'wrong goal', 'blank goal', 'random actions', 'shortest path')
-CONTROLS = (OTHER, WRONG, BLANK, RANDOM, SHORTEST)
+STOPS = (ARRIVAL, DECLARED)
+OTHER, WRONG, ABSENT, BLANK, RANDOM, EXPLORER, SHORTEST = (
+    'other decoding', 'wrong goal', 'absent goal', 'blank goal', 'random actions', 'explorer',
+    'shortest path')
+CONTROLS = (OTHER, WRONG, ABSENT, BLANK, RANDOM, EXPLORER, SHORTEST)
 STOP_THRESHOLD = 0.5  # of the arrival head's probability, by default
 SCENES_AT_ONCE = 16  # in memory
 ENVIRONMENTS = 50  # at most at once, unless there are more scenes
+SAME_FOV = 0.01  # share by which two fields of view may differ
 
 
 def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: int,
@@ -34,7 +41,7 @@ def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: i
     Args:
         env: its rewards should be the sparse ones.
         actor: chooses the actions; what it says in an attribute `filtered`, as `PolicyActor` has
-            it, is counted.
+            it, is counted, and what its method `snapshot` says is kept of ended episodes.
         episodes: at least this many; rounded up to the same number in each environment.
         seed: of the environment: equal seeds give equal starts.
         robot: for the duration of actions at its default limits.
@@ -53,6 +60,7 @@ def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: i
     collisions, seconds, reward = np.zeros(count, int), np.zeros(count), np.zeros(count)
     filtered = np.zeros((2, count), int)
     reached = np.zeros(count, bool)
+    look_inside = getattr(actor, 'snapshot', None)
     observation, info = env.reset(seed=seed)
     paths = [[pose[:3]] for pose in info['pose']]
     contacts: list[list[np.ndarray]] = [[] for _ in range(count)]
@@ -88,12 +96,21 @@ def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: i
                           else bool(actions[n] == env.declare_action)),
                 reached=bool(reached[n]),
                 filtered=None if behind_filter is None else tuple(filtered[:, n].tolist()),
+                at_shown=_at_shown(env, info, n),
                 trajectory=np.array(paths[n]),
                 contacts=np.array(contacts[n]).reshape(-1, 2),
+                search=None if look_inside is None else look_inside(n),
                 goal_pose=None if poses is None else tuple(poses[info['goal'][n]].tolist())))
             collisions[n], seconds[n], reward[n], reached[n] = 0, 0.0, 0.0, False
             filtered[:, n] = 0
     return [episode for own in found for episode in own[:each]]
+
+
+def _at_shown(env: MeasuredVectorEnv, info: dict, n: int) -> bool | None:
+    """See `Episode.at_shown`."""
+    if env.declare_action is None or not info.get('shown_other', np.zeros(n + 1, bool))[n]:
+        return None
+    return bool(info['at_shown'][n])
 
 
 def _goal_poses(env: MeasuredVectorEnv) -> np.ndarray | None:
@@ -117,6 +134,8 @@ class PolicyActor:
         seed: of the sampled actions.
         threshold: probability of having arrived above which it declares.
         known: scenes that it was trained in, for a network with layers for several scenes.
+        camera_fov: field of view that it was trained with [rad]; None: that of the robots. Larger
+            pictures of a robot with another one are made its own, as `policy_node` does.
 
     Attributes:
         filtered: [2,N] bool: where the action filter acted on the last actions, and where it
@@ -124,10 +143,17 @@ class PolicyActor:
     """
 
     def __init__(self, env: MeasuredVectorEnv, network: Policy, decoding: str, seed: int,
-                 threshold: float = STOP_THRESHOLD, known: Sequence[str] = ()):
+                 threshold: float = STOP_THRESHOLD, known: Sequence[str] = (),
+                 camera_fov: float | None = None):
         self.env, self.threshold = env, threshold
+        self._size, self._camera_fov = network.config.size, camera_fov
+        self._goals: tuple[np.ndarray, np.ndarray] | None = None  # the robots', and the network's
         self.known = known if network.config.scenes > 1 else ()
-        self.policy = BatchedPolicy(network, env.num_envs, decoding=decoding, seed=seed)
+        self.policy = BatchedPolicy(
+            network, env.num_envs, decoding=decoding, seed=seed,
+            scanner=getattr(env, 'scanner', None),
+            zoom=(max(zoom_of(env.robot.camera_fov, network.config.view), 1.0)
+                  if network.config.architecture == SEARCH else 1.0))
         self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
@@ -135,7 +161,10 @@ class PolicyActor:
         if self.known:
             scene = scene_numbers([self.env.places[place].name for place in self.env.place_index],
                                   self.known)
-        goals = self.env.goals
+        observation = {**observation, 'image': self._own(observation['image'])}
+        if self._goals is None or self._goals[0] is not self.env.goals:
+            self._goals = self.env.goals, self._own(self.env.goals)
+        goals = self._goals[1]
         known = getattr(self.env, 'goal_features', None)
         if known is not None and self.policy.takes_features(known.shape[-1]):
             goals = known
@@ -149,19 +178,29 @@ class PolicyActor:
         return actions if declare is None or not declares.any() else np.where(
             declares, declare, actions)
 
-    @property
-    def knows_arrival(self) -> bool:
-        """Whether the network says if it has arrived; known after the first action."""
-        return bool(np.isfinite(self.policy.arrival).all())
+    def snapshot(self, n: int) -> Snapshot | None:
+        """What a policy that searches knows in environment n; None: it is another."""
+        search = self.policy.search
+        return None if search is None else snapshot(search.searchers[n])
+
+    def _own(self, pictures: np.ndarray) -> np.ndarray:
+        """Pictures [K,3,H,H] of the robots' cameras as the network takes them."""
+        if self._camera_fov is None or (
+                self.env.robot.camera_fov <= (1 + SAME_FOV) * self._camera_fov):
+            return pictures
+        fov = self.env.robot.camera_fov
+        return np.stack([preprocess(picture.transpose(1, 2, 0), self._size, fov=fov,
+                                    target_fov=self._camera_fov) for picture in pictures])
 
 
 def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decoding: str,
             episodes: int = 100, controls: Sequence[str] = CONTROLS,
             threshold: float | None = None, seed: int = 10_000, known: Sequence[str] = (),
-            robot: RobotSpec | None = None) -> Rows:
+            robot: RobotSpec | None = None, camera_fov: float | None = None,
+            stops: Sequence[str] = STOPS, own: bool = True) -> Rows:
     """Episodes of a policy and of its controls, the same number in each scene.
 
-    A network with an arrival head is measured a second time, with declared stops.
+    A network that can declare its stop is measured a second time, with declared stops.
 
     Args:
         make_env: (scenes, environments, stop) -> vector environment in which environment i lives
@@ -175,11 +214,21 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
         seed: of environments and sampled actions.
         known: scenes that the policy was trained in, see `PolicyActor`.
         robot: for durations; that of the environment if left out.
+        camera_fov: see `PolicyActor`.
+        stops: which of `STOPS`.
+        own: the policy itself drives to its goals; else the controls alone.
 
     Returns:
         By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
-        'declared': ...}; without an arrival head 'arrival' alone.
+        'declared': ...}; the second only where the policy can declare.
+
+    Raises:
+        UserError: declared stops alone, of a policy that cannot declare.
     """
+    if ARRIVAL not in stops and not network.config.declares:
+        raise UserError('a policy that declares its stop has the head arrival, or searches',
+                        f'heads {", ".join(network.config.heads) or "none"}',
+                        'measure arrival as well')
     rows: Rows = {}
     threshold = STOP_THRESHOLD if threshold is None else threshold
     each = -(-episodes // len(scenes))
@@ -187,37 +236,47 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
         part = list(scenes[begin:begin + SCENES_AT_ONCE])
         rounds = -(-each // max(1, ENVIRONMENTS // len(part)))
         environments = len(part) * -(-each // rounds)
-        for stop in (ARRIVAL, DECLARED):
+        for stop in stops:
+            if stop == DECLARED and not network.config.declares:
+                continue
             with contextlib.closing(make_env(part, environments, stop)) as env:
                 actors = make_actors(env, network, decoding, controls, threshold, seed + chunk,
-                                     known)
+                                     known, camera_fov, own)
                 for name, (actor, shown) in actors.items():
                     env.set_shown_goal(shown)
                     rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
                         env, actor, rounds * environments, seed=seed + chunk,
                         robot=robot or env.robot))
-                own, _ = next(iter(actors.values()))
-                if (env.config.task != 'image' or env.simulator.capabilities.rewards
-                        or not (isinstance(own, PolicyActor) and own.knows_arrival)):
-                    break  # nothing to declare, or nobody to declare it
+                if env.config.task != 'image' or env.simulator.capabilities.rewards:
+                    break  # nothing to declare
     return rows
 
 
 def make_actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
-                seed: int, known: Sequence[str] = ()) -> dict[str, tuple[Actor, str]]:
-    """Who drives in each row, and which goal picture it is shown; the policy itself first."""
-    def policy(rule: str = decoding) -> Actor:
-        return PolicyActor(env, network, rule, seed, threshold, known)
+                seed: int, known: Sequence[str] = (), camera_fov: float | None = None,
+                own: bool = True) -> dict[str, tuple[Actor, str]]:
+    """Who drives in each row, and which goal picture it is shown; the policy itself first.
 
-    rows = {f'right goal, {decoding}': (policy(), 'right')}
+    Args: see `measure`.
+    """
+    def policy(rule: str = decoding) -> Actor:
+        return PolicyActor(env, network, rule, seed, threshold, known, camera_fov)
+
+    rows: dict[str, tuple[Actor, str]] = {}
+    if own:
+        rows[f'right goal, {decoding}'] = policy(), 'right'
     if OTHER in controls and network.config.architecture != SEARCH:  # which draws no lots
         other = 'greedy' if decoding == 'sample' else 'sample'
         rows[f'right goal, {other}'] = policy(other), 'right'
-    for name, shown in ((WRONG, 'wrong'), (BLANK, 'blank')):
-        if name in controls:
+    # Where arriving is enough, an absent goal's picture says no more than a blank one.
+    absent = env.declare_action is not None and len(env.places) > 1
+    for name, shown in ((WRONG, 'wrong'), (ABSENT, 'absent'), (BLANK, 'blank')):
+        if name in controls and (name != ABSENT or absent):
             rows[name] = policy(), shown
     if RANDOM in controls:
         rows[RANDOM] = random_actor(env, seed), 'right'
+    if EXPLORER in controls and isinstance(env, ExploringEnv) and env.explores:
+        rows[EXPLORER] = (lambda observation, reset: env.explorer_actions()), 'right'
     if SHORTEST in controls:
         rows[SHORTEST] = (lambda observation, reset: env.oracle_actions()), 'right'
     return rows

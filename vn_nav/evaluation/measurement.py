@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from vn_nav.evaluation import evaluator
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
 from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import SEARCH
 from vn_nav.robot import RobotSpec
 
 
@@ -30,6 +32,8 @@ class EvaluateConfig:
     # Probability above which the arrival head declares a stop; None: the checkpoint's.
     stop_threshold: float | None = None
     robot: RobotSpec | None = None  # for durations; None: the scenes' own
+    stops: tuple[str, ...] = evaluator.STOPS  # what ends the episodes
+    policy: bool = True  # the policy itself drives to its goals; else the controls alone
 
     def __post_init__(self):
         threshold = self.stop_threshold
@@ -43,6 +47,8 @@ class EvaluateConfig:
             (set(self.controls) <= set(evaluator.CONTROLS),
              f'controls are some of {", ".join(evaluator.CONTROLS)}', self.controls,
              'choose some of them'),
+            (0 < len(self.stops) and set(self.stops) <= set(evaluator.STOPS),
+             f'stops are some of {", ".join(evaluator.STOPS)}', self.stops, 'choose some of them'),
         )
         for kept, rule, received, remedy in rules:
             if not kept:
@@ -65,7 +71,8 @@ class Evaluation:
 
 
 def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions: int,
-               decoding: str, seed: int, odometry: str) -> dict:
+               decoding: str, seed: int, odometry: str, ranges: str = 'picture',
+               camera: str | None = None) -> dict:
     """A result without splits: what all of them have in common.
 
     Args:
@@ -77,14 +84,22 @@ def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions
         decoding: 'sample' or 'greedy'.
         seed: of the episodes.
         odometry: that the policy was given: true, drift, commanded, or none.
+        ranges: that its map was given: picture, scan or depth.
+        camera: of the robots, in words; None: the one that the policy was trained with.
     """
     return {'checkpoint': checkpoint,
             **({'sha256': info['sha256']} if 'sha256' in info else {}),
             'bag': bag, 'simulator': info['simulator'],
             'world_version': info['world_version'], 'task': info['task'],
             'decoding': decoding, 'max_decisions': max_decisions, 'seed': seed,
-            'odometry': odometry,
+            'odometry': odometry, 'ranges': ranges, 'camera': camera or camera_name(
+                info['camera_fov_deg'], info['camera_height']),
             'date': datetime.date.today().isoformat(), 'splits': {}}
+
+
+def camera_name(fov_deg: float, height: float) -> str:
+    """A camera in words: its field of view [deg] and height above the floor [m]."""
+    return f'{fov_deg:.3g} deg, {height:.3g} m high'
 
 
 def odometry_for(network: Policy, wanted: str | None = None) -> str:
@@ -101,6 +116,22 @@ def odometry_for(network: Policy, wanted: str | None = None) -> str:
         raise UserError('odometry is for policies that use it', f'{wanted}; this one uses none',
                         'leave it out (--odometry)')
     return wanted or ('drift' if network.uses_odometry else 'none')
+
+
+def ranges_for(network: Policy, wanted: str | None = None) -> str:
+    """The ranges that the map of a policy is measured with: picture, scan or depth.
+
+    Args:
+        network: the policy.
+        wanted: by the user; None: picture, what the network sees itself.
+
+    Raises:
+        UserError: the policy has no map.
+    """
+    if wanted not in (None, 'picture') and network.config.architecture != SEARCH:
+        raise UserError('measured ranges are for policies that search with a map',
+                        f'{wanted}; this one has none', 'leave it out (--ranges)')
+    return wanted or 'picture'
 
 
 def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make_env: Callable,
@@ -121,6 +152,8 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
         # One goal has no other to take for it; where there is none, none is shown.
         if min(len(place.goals) for place in env.places) < 2 and evaluator.WRONG in controls:
             controls.remove(evaluator.WRONG)
+        if env.config.task != 'image' and evaluator.ABSENT in controls:
+            controls.remove(evaluator.ABSENT)
         if can.own_actions and evaluator.BLANK in controls:
             controls.remove(evaluator.BLANK)
         return env
@@ -128,7 +161,9 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
     return evaluator.measure(
         make, checkpoint.network, scenes, known=info['scenes'],
         decoding=config.decoding or info['decoding'], episodes=config.episodes,
-        controls=controls, seed=config.seed, robot=config.robot,
+        controls=controls, seed=config.seed, robot=config.robot, stops=config.stops,
+        own=config.policy,
+        camera_fov=math.radians(info['camera_fov_deg']),
         threshold=(info.get('stop_threshold') if config.stop_threshold is None
                    else config.stop_threshold))
 
@@ -159,20 +194,26 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
     for split, scenes in splits.items():
         plans = done.plans[split] = {}
         configs: list[Any] = []
+        cameras: list[str] = []
         world: dict[str, str] = {}
 
         def make(names: Sequence[str], environments: int, stop: str, split: str = split,
-                 plans: dict = plans, configs: list[Any] = configs, world: dict = world):
+                 plans: dict = plans, configs: list[Any] = configs, world: dict = world,
+                 cameras: list[str] = cameras):
             env = make_env(split, names, environments, stop)
             world.update(simulator=env.simulator_name, world_version=env.world_version)
             plans.update({place.name: place.plan() for place in env.places})
             configs.append(env.config)
+            cameras.append(camera_name(math.degrees(env.robot.camera_fov),
+                                       env.robot.camera_height))
             return env
 
         measured = done.measured[split] = measure_checkpoint(checkpoint, scenes, make, config)
         done.result = done.result or new_result(
             {**checkpoint.info, **world}, checkpoint=name, bag=bag,
             max_decisions=configs[0].max_decisions, odometry=configs[0].odometry,
+            ranges=configs[0].ranges,
+            camera=cameras[0],
             decoding=config.decoding or checkpoint.info['decoding'], seed=config.seed)
         done.result['splits'][split] = evaluator.split_figures(measured, scenes)
         on_split(split, done.result)

@@ -10,10 +10,16 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vn_nav.arrival import ARRIVAL_RADIUS
+
+if TYPE_CHECKING:
+    from vn_nav.policy.search.snapshot import Snapshot
+
+HABITAT_RADIUS_M = 1.0  # of Habitat's ImageNav: declared within it, whatever the heading
 
 
 def _hidden():
@@ -40,10 +46,15 @@ class Episode:
     reached: bool = False  # was at the goal at the end of some decision, declared or not
     # Decisions at which the policy's action filter acted, and changed the action; None: no filter.
     filtered: tuple[int, int] | None = None
+    # Whether it ended where the picture that it was shown was taken, as the crow flies; None: it
+    # was shown its goal, or no picture.
+    at_shown: bool | None = None
     # What a map shows; no figure depends on it.
     trajectory: np.ndarray | None = _hidden()  # [K,3] x, y [m], yaw [rad]: start and decisions
     contacts: np.ndarray | None = _hidden()  # [C,2] where the robot touched something [m]
     goal_pose: tuple[float, float, float] | None = _hidden()  # x, y, yaw; None: no such place
+    # What a policy that searches knew before its last move, in a frame that begins at the start.
+    search: Snapshot | None = _hidden()
 
 
 def path_efficiency(episode: Episode) -> float:
@@ -58,6 +69,18 @@ def path_efficiency(episode: Episode) -> float:
     shortest = max(episode.start_distance - radius, 0.0)
     longest = max(episode.path_length, shortest)
     return float(episode.success) * (shortest / longest if longest > 0 else 1.0)
+
+
+def within_habitats_radius(episode: Episode) -> bool:
+    """Whether it is a success by Habitat's rule: declared within 1 m, whatever the heading."""
+    return bool(episode.declared) and episode.stop_distance <= HABITAT_RADIUS_M
+
+
+def habitats_efficiency(episode: Episode) -> float:
+    """As `path_efficiency`, by Habitat's rule, and to the goal itself."""
+    shortest = episode.start_distance
+    longest = max(episode.path_length, shortest)
+    return float(within_habitats_radius(episode)) * (shortest / longest if longest > 0 else 1.0)
 
 
 def bootstrap_interval(values: Sequence[float], *, samples: int = 2000, seed: int = 0
@@ -82,11 +105,13 @@ def summarise(episodes: Sequence[Episode]) -> dict:
     `stop_error_steps` stands in place of `stop_error_m`, and `start_distance` counts steps. Stop
     errors and seconds are None where a simulator's actions are no motions.
 
-    Under declared stop there are three more: `declared` and `false_stops`, the shares of episodes
-    that the policy ended, and that it ended in vain, and `reached`, the share in which the robot
-    stood at its goal at some time, whether it said so or not. Behind an action filter there are
-    two: `filter_acted` and `filter_changed`, the shares of decisions at which it offset a logit,
-    and at which another action came out than without it.
+    Under declared stop there are more: `declared` and `false_stops`, the shares of episodes that
+    the policy ended, and that it ended in vain; `reached`, the share in which the robot stood at
+    its goal at some time, whether it said so or not; `within_1m` and `spl_within_1m`, success and
+    SPL by Habitat's rule (None on a grid); and, where another picture than the goal's was shown,
+    `stops_at_shown`, the share that the policy ended at that one. Behind an action filter there
+    are two: `filter_acted` and `filter_changed`, the shares of decisions at which it offset a
+    logit, and at which another action came out than without it.
 
     Raises:
         ValueError: no episodes, or episodes of both kinds.
@@ -125,7 +150,14 @@ def summarise(episodes: Sequence[Episode]) -> dict:
             'declared': float(np.mean([e.declared for e in episodes])),
             'false_stops': float(np.mean([e.declared and not e.success for e in episodes])),
             'reached': float(np.mean([e.reached for e in episodes])),
+            'within_1m': None if unit != 'm' else float(
+                np.mean([within_habitats_radius(e) for e in episodes])),
+            'spl_within_1m': None if unit != 'm' else _mean_or_none(
+                [habitats_efficiency(e) for e in episodes]),
         }
+        if all(e.at_shown is not None for e in episodes):
+            figures['stops_at_shown'] = float(np.mean(
+                [bool(e.declared and e.at_shown) for e in episodes]))
     filtered = [e.filtered for e in episodes if e.filtered is not None]
     if len(filtered) == len(episodes):
         figures |= {name: sum(counts[k] for counts in filtered) / max(decisions, 1)

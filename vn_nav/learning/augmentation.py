@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-SHARE = 0.5  # of the pictures that are changed
+SHARE = 0.4  # of the pictures that are changed
 GAMMA = 1.8  # at most, and its inverse at least
 CONTRAST = 1.6  # likewise, about the picture's own mean
 GAIN = 0.18  # of a colour channel, at most

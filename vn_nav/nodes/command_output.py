@@ -46,6 +46,7 @@ class CommandOutput:
     Attributes:
         publisher: of the commands.
         odometry: [3] x, y [m], yaw [rad] of the newest message; None before the first.
+        odometry_frame: name of the frame that they are in.
         track: its poses, for `pose_at`.
     """
 
@@ -58,6 +59,7 @@ class CommandOutput:
         self._stamped, self._patience = stamped, patience
         self.publisher = node.create_publisher(TwistStamped if stamped else Twist, name, qos(name))
         self.odometry: np.ndarray | None = None
+        self.odometry_frame = 'odom'
         self.track = PoseTrack()
         self._stamp = 0.0  # of the odometry
         self._rests = True  # says the odometry
@@ -98,6 +100,7 @@ class CommandOutput:
                 self._navigator.odometry_jumped(jump)
                 self.track.cut()
             self.odometry, self._stamp = values[:3], values[6]
+            self.odometry_frame = message.header.frame_id or self.odometry_frame
             self.track.add(values[6], values[:3])
             self._rests = not values[3:6].any()
             self._received = now

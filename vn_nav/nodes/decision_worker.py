@@ -15,16 +15,21 @@ from std_msgs.msg import Bool, Int8, String
 
 from vn_msgs_py import images
 from vn_nav.nodes.command_output import CommandOutput
+from vn_nav.nodes.map_output import MapOutput
 from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.range_input import RangeInput
 from vn_nav.nodes.window import Window
-from vn_nav.observation import crop_fraction, needed_side, preprocess
+from vn_nav.observation import needed_side
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 
 WINDOW_S = 5.0  # that rates and latencies are measured over
+# That a picture waits for the ranges measured with it: scanners turn 10 times a second. In
+# lock-step only topics are not in order.
+RANGES_PATIENCE_S, LOCK_STEP_RANGES_PATIENCE_S = 0.15, 1.0
 
 
 class Executed(NamedTuple):
@@ -47,23 +52,27 @@ class DecisionWorker:
         wake: guards the navigator and what this object keeps.
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
         shadow: decide only after `note_executed`, for a robot that somebody else drives.
+        ranges: measured ranges for the map; None: it takes those that are seen in the pictures.
 
     Attributes:
-        camera_fov: field of view of the camera [rad], as far as it is known.
+        camera_fov: field of view of the camera's shorter side [rad], as far as it is known.
         inferences: seconds that the decisions of the last while took.
         publishers: what `create_publisher` made.
     """
 
     def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
                  output: CommandOutput, wake: threading.Condition, *, lock_step: bool,
-                 shadow: bool = False):
+                 shadow: bool = False, ranges: RangeInput | None = None):
         self._node, self._navigator, self._runtime = node, navigator, runtime
         self._output, self._wake, self._lock_step = output, wake, lock_step
         self._breaks = output.track.breaks  # of the odometry, that the runtime knows of
-        self._shadow = shadow
+        self._shadow, self._ranges = shadow, ranges
+        self._waits_from: float | None = None  # steady time [s]: pictures wait for ranges
+        self._map = None if runtime.search is None else MapOutput(node)
         self._executed: Executed | None = None
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
         self.camera_fov: float | None = None
+        self._camera_aspect = 1.0  # width of its pictures over their height
         self._frame: tuple | None = None  # the newest message, its stamp, when it came
         self._goal: Image | None = None  # to be taken
         self._goal_in_force: Image | None = None
@@ -74,6 +83,7 @@ class DecisionWorker:
             node.create_publisher(kind, name, qos(name)) for kind, name in (
                 (Int8, 'action'), (String, 'action_names'), (Bool, 'arrived'))]
         names.publish(String(data=json.dumps(list(runtime.action_names))))
+        self.publishers += [] if self._map is None else self._map.publishers
         self.publish_arrival()
 
     def show_frame(self, message, stamp: float, received: float) -> None:
@@ -114,14 +124,20 @@ class DecisionWorker:
                 self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
 
-    def set_camera_fov(self, fov: float) -> None:
-        """What the camera says of itself [rad]. The goal was cropped for what it said before."""
+    def set_camera_fov(self, fov: float, aspect: float = 1.0) -> None:
+        """What the camera says of itself. The goal was cropped for what it said before.
+
+        Args:
+            fov: field of view of the pictures' shorter side [rad].
+            aspect: their width over their height.
+        """
         with self._wake:
-            known = self.camera_fov is not None and math.isclose(fov, self.camera_fov,
-                                                                 rel_tol=1e-3)
+            known = self.camera_fov is not None and math.isclose(
+                fov, self.camera_fov, rel_tol=1e-3) and math.isclose(
+                    aspect, self._camera_aspect, rel_tol=1e-3)
             if known:
                 return
-            self.camera_fov = fov
+            self.camera_fov, self._camera_aspect = fov, aspect
             if self._goal is None and self._goal_in_force is not None:
                 self._goal = self._goal_in_force
                 self._wake.notify_all()
@@ -137,7 +153,7 @@ class DecisionWorker:
     def check_fov(self) -> None:
         """Raise UserError where the camera sees less than the policy needs."""
         if self.camera_fov is not None:
-            crop_fraction(self.camera_fov, self._runtime.camera_fov)
+            self._runtime.check_camera(self.camera_fov, self._camera_aspect)
 
     def publish_arrival(self, *, again: bool = False) -> None:
         """Publish whether the robot stands where the policy has arrived, when that changed.
@@ -169,10 +185,10 @@ class DecisionWorker:
         with self._wake:
             self._goal_in_force = message
         # A goal picture comes from a camera like this one; it is cropped the same way.
-        picture = prepared(self._prepare, message, self._wake, self._refuse_goal)
-        if picture is None:
+        found = prepared(self._prepare, message, self._wake, self._refuse_goal)
+        if found is None:
             return
-        self._runtime.set_goal(picture)
+        self._runtime.set_goal(found[0])
         with self._wake:
             if self._goal is None:  # else a newer one is waiting
                 stamp = message.header.stamp
@@ -185,10 +201,11 @@ class DecisionWorker:
         self._navigator.refuse_goal(why)
 
     def _take_frame(self, message, stamp: float, received: float) -> None:
-        picture = prepared(self._prepare, message, self._wake,
-                           lambda why: self._navigator.bad_frame(why, time.monotonic()))
-        if picture is None:
+        found = prepared(self._prepare, message, self._wake,
+                         lambda why: self._navigator.bad_frame(why, time.monotonic()))
+        if found is None:
             return
+        picture, zoom = found
         with self._wake:
             now = time.monotonic()
             self._navigator.good_frame(received)
@@ -198,6 +215,9 @@ class DecisionWorker:
             executed = self._executed if self._shadow else None
             if self._shadow and (executed is None or stamp < executed.stamp):
                 return
+            if not self._has_ranges(stamp):
+                return
+            now = time.monotonic()
             ticket = self._navigator.request(stamp, now)
             if ticket is None:
                 return
@@ -209,8 +229,9 @@ class DecisionWorker:
         if breaks != self._breaks:
             self._breaks = breaks
             self._runtime.reset_odometry()
+        scan = None if self._ranges is None else self._ranges.scan_at(stamp)
         try:
-            action = self._runtime.act(picture, pose)
+            action = self._runtime.act(picture, pose, scan, zoom)
         except FloatingPointError as error:
             with self._wake:
                 self._navigator.stop(str(error), time.monotonic())
@@ -228,9 +249,34 @@ class DecisionWorker:
                 if self._navigator.decided(ticket, action, now):
                     self._action.publish(Int8(data=action))
             self._wake.notify_all()
+        if self._map is not None and self._runtime.search is not None:
+            self._map.publish(self._runtime.search.searchers[0], pose,
+                              self._output.odometry_frame, message.header.stamp)
 
-    def _prepare(self, message) -> np.ndarray:
-        fov = {} if self.camera_fov is None else {
-            'fov': self.camera_fov, 'target_fov': self._runtime.camera_fov}
-        smallest = needed_side(self._runtime.size, **fov)
-        return preprocess(images.decode_rgb(message, smallest), self._runtime.size, **fov)
+    def _has_ranges(self, stamp: float) -> bool:
+        """Wait a moment for the ranges measured with a picture that a decision needs.
+
+        Returns:
+            False: a newer picture has come meanwhile, which may wait for the rest of that moment.
+        """
+        ranges = self._ranges
+        if ranges is None or not ranges.is_alive or not self._navigator.wants(stamp):
+            self._waits_from = None
+            return True
+        now = time.monotonic()
+        self._waits_from = self._waits_from or now
+        patience = LOCK_STEP_RANGES_PATIENCE_S if self._lock_step else RANGES_PATIENCE_S
+        self._wake.wait_for(
+            lambda: (ranges.has(stamp) or self._frame is not None or self._goal is not None
+                     or not self._navigator.wants(stamp)),
+            timeout=max(self._waits_from + patience - now, 0.0))
+        if self._frame is not None and not ranges.has(stamp) and (
+                time.monotonic() < self._waits_from + patience):
+            return False
+        self._waits_from = None
+        return True
+
+    def _prepare(self, message) -> tuple[np.ndarray, float]:
+        fov = self.camera_fov
+        smallest = needed_side(self._runtime.size, fov, self._runtime.camera_fov)
+        return self._runtime.prepare(images.decode_rgb(message, smallest), fov)

@@ -17,6 +17,7 @@ from vn_msgs_py.camera import field_of_view
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.decision_worker import WINDOW_S, DecisionWorker
 from vn_nav.nodes.qos import other_types, qos, subscribe
+from vn_nav.nodes.range_input import RangeInput
 from vn_nav.nodes.window import Window
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_watch import GoalWatch
@@ -37,6 +38,7 @@ class PolicyInputs:
         compressed: pictures come on image_raw/compressed.
         lock_step: stamps are the simulator's ticks, and nothing is late.
         shadow: somebody else drives, and publishes what was done.
+        ranges: measured ranges, for the diagnostics; None: there are none.
 
     Attributes:
         subscriptions: what was made.
@@ -44,9 +46,10 @@ class PolicyInputs:
     """
 
     def __init__(self, node, navigator: Navigator, worker: DecisionWorker, output: CommandOutput,
-                 wake: threading.Condition, *, compressed: bool, lock_step: bool, shadow: bool):
+                 wake: threading.Condition, *, compressed: bool, lock_step: bool, shadow: bool,
+                 ranges: RangeInput | None = None):
         self._node, self._navigator, self._worker, self._output = node, navigator, worker, output
-        self._wake, self._lock_step = wake, lock_step
+        self._wake, self._lock_step, self._ranges = wake, lock_step, ranges
         self._goals = GoalWatch(trust_stamps=lock_step)
         self._frames, self._odometry = Window(WINDOW_S), Window(WINDOW_S)  # frames: their ages [s]
         self._types: dict[str, type] = {}  # by resolved name
@@ -129,7 +132,7 @@ class PolicyInputs:
                 f'a camera sees {least:.0f} to {most:.0f} deg; camera_info says '
                 f'{math.degrees(fov):.3g}: calibrate the camera', throttle_duration_sec=10.0)
             return
-        self._worker.set_camera_fov(fov)
+        self._worker.set_camera_fov(fov, message.width / message.height)
 
     # What is missing or wrong with them.
 
@@ -153,7 +156,7 @@ class PolicyInputs:
         if (self._output.odometry is None and not self._lock_step and not warnings
                 and self._navigator.state in ENABLED):
             warnings.append(f'no odometry on {self.odometry_topic}: actions run on time alone')
-        return warnings
+        return warnings + (self._ranges.warnings() if self._ranges else [])
 
     def values(self) -> dict[str, str]:
         """Rates and latencies of the last seconds, for the diagnostics."""
@@ -163,7 +166,9 @@ class PolicyInputs:
                 'frame_age_ms': _milliseconds(self._frames.median(now)),
                 'inference_ms': _milliseconds(inferences.median(now)),
                 'inference_ms_max': _milliseconds(inferences.largest(now)),
-                'odometry_rate_hz': f'{self._odometry.rate(now):.1f}'}
+                'odometry_rate_hz': f'{self._odometry.rate(now):.1f}',
+                **({key: str(value) for key, value in self._ranges.values().items()}
+                   if self._ranges else {})}
 
 
 def _pose(values: object) -> np.ndarray:

@@ -26,6 +26,7 @@ from vn_nav.nodes.decision_worker import DecisionWorker
 from vn_nav.nodes.policy_inputs import PolicyInputs
 from vn_nav.nodes.policy_operation import Operation
 from vn_nav.nodes.process import Ended, run_node
+from vn_nav.nodes.range_input import RangeInput, RangeSource
 from vn_nav.nodes.work_threads import WorkThreads
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Limits, Navigator
@@ -95,12 +96,16 @@ class PolicyNode(LifecycleNode):
         value = policy_parameters.read(self)
         self.lock_step = value['time'] == 'lock_step'
         self.auto_enable = value['auto_enable']
+        source = RangeSource(value['scan_topic'], value['depth_topic'],
+                             (value['scan_x'], value['scan_y'], value['scan_yaw']))
+        source.check()
         robot = load_robot(value['robot']) if value['robot'] else RobotSpec()
         threshold = value['stop_threshold']
         runtime = PolicyRuntime(value['checkpoint'] or share_file('models/house'),
                                 seed=value['seed'], decoding=value['decoding'] or None,
                                 stop_threshold=None if threshold < 0 else threshold)
         robot = robot.with_actions(runtime.action_names, runtime.moves)
+        source.check_policy(searches=runtime.search is not None)
         shadow = value['mode'] == 'shadow'
         if self.lock_step:
             limit = SHADOW_LIMIT_S if shadow else policy_parameters.LOCK_STEP_LIMIT_S
@@ -116,12 +121,16 @@ class PolicyNode(LifecycleNode):
             # In a shadow nothing waits for commands: each answers odometry or a decision.
             name=f'shadow/{TOPIC}' if shadow else TOPIC,
             patience=None if shadow else LOCK_STEP_SILENCE_S)
+        self._ranges = RangeInput(self, self.navigator, self._output, self._wake, source,
+                                  robot) if source else None
         self._worker = DecisionWorker(self, self.navigator, runtime, self._output, self._wake,
-                                      lock_step=self.lock_step, shadow=shadow)
+                                      lock_step=self.lock_step, shadow=shadow,
+                                      ranges=self._ranges)
         self._require_odometry = value['require_odometry']
         self._inputs = PolicyInputs(self, self.navigator, self._worker, self._output, self._wake,
                                     compressed=value['image_transport'] == 'compressed',
-                                    lock_step=self.lock_step, shadow=shadow)
+                                    lock_step=self.lock_step, shadow=shadow,
+                                    ranges=self._ranges)
         self._make_interfaces()
 
     def _make_interfaces(self) -> None:
@@ -131,7 +140,8 @@ class PolicyNode(LifecycleNode):
             require_odometry=self._require_odometry)
         self._interfaces = [
             *((self.destroy_subscription, subscription)
-              for subscription in self._inputs.subscriptions),
+              for subscription in (*self._inputs.subscriptions,
+                                   *(self._ranges.subscriptions if self._ranges else ()))),
             *((self.destroy_publisher, publisher) for publisher in (
                 self._output.publisher, *self._worker.publishers)),
         ]

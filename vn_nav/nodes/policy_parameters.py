@@ -40,6 +40,13 @@ PARAMETERS = {
                               'motion it latches a stop [s]', (0.05, 5.0)),
     'require_odometry': (False, 'enable motion only with odometry: without it actions run on '
                                 'time alone', None),
+    'scan_topic': ('', 'sensor_msgs/LaserScan that the map of a policy which searches takes in '
+                       "place of the pictures' ranges; empty: none", None),
+    'depth_topic': ('', 'the same of depth pictures, with camera_info beside them; empty: none',
+                    None),
+    'scan_x': (0.0, 'where that sensor sits on the robot: ahead of its centre [m]', (-2.0, 2.0)),
+    'scan_y': (0.0, 'to the left of it [m]', (-2.0, 2.0)),
+    'scan_yaw': (0.0, 'its heading [rad], positive to the left', (-3.2, 3.2)),
     'settle_time': (0.1, "from a motion's last command to a frame at rest [s]", (0.0, 2.0)),
 }
 

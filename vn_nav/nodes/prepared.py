@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
-import numpy as np
+Prepared = TypeVar('Prepared')
 
 
-def prepared(prepare: Callable[[Any], np.ndarray], message: Any, wake: threading.Condition,
-             refuse: Callable[[str], None]) -> np.ndarray | None:
+def prepared(prepare: Callable[[Any], Prepared], message: Any, wake: threading.Condition,
+             refuse: Callable[[str], None]) -> Prepared | None:
     """What `prepare` makes of a message; None: it failed.
 
     Whatever is thrown, the message is as good as none and no thread ends: `refuse` gets the

@@ -37,7 +37,7 @@ COMPRESSED = 'image_raw/compressed'  # a bag needs a picture once: only where th
 PARAMETERS = {
     'output': ('', 'folder of the bag; it must not exist; empty: rosbag2_ and the date'),
     'topics': ([entry.name for entry in TOPICS
-                if installed(entry.type) and entry.name != COMPRESSED],
+                if installed(entry.type) and entry.name != COMPRESSED and not entry.debug],
                'topics to record: names of the contract, or name:type; left as it is: also '
                f'{COMPRESSED} where no raw pictures are published'),
     'all': (False, 'record all other published topics as well'),

@@ -230,6 +230,10 @@ class Navigator:
                 and (self.phase is Phase.LOOK or self.continuous)
                 and self._pending_action is None)
 
+    def is_since_rest(self, stamp: float) -> bool:
+        """Whether what was measured at a stamp shows the place as a picture at rest does."""
+        return self.continuous or stamp > self._look_after
+
     def request(self, stamp: float, now: float) -> int | None:
         """A ticket, when a decision from a frame with this stamp is wanted now."""
         if not self.wants(stamp):

@@ -9,7 +9,15 @@ import numpy as np
 import torch
 
 from vn_nav.errors import UserError
-from vn_nav.observation import Observation
+from vn_nav.measured_ranges import Scan, Scanner
+from vn_nav.observation import (
+    Observation,
+    check_lens,
+    crop_fraction,
+    fov_across,
+    preprocess,
+    through_lens,
+)
 from vn_nav.policy.action_filter import FilterCounts, make_filter
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
@@ -125,6 +133,37 @@ class PolicyRuntime:
         self.arrival = math.nan
         self.reset()
 
+    def check_camera(self, fov: float, aspect: float) -> None:
+        """Whether this policy can drive by a camera.
+
+        Args:
+            fov: of the picture's shorter side [rad]; aspect: its width over its height.
+
+        Raises:
+            UserError: it sees too little or, for a policy that searches, too much.
+        """
+        if self.search is None:
+            crop_fraction(fov, self.camera_fov)
+        else:
+            check_lens(fov_across(fov, aspect))
+
+    def prepare(self, picture: np.ndarray, fov: float | None = None, zoom: float | None = None
+                ) -> tuple[np.ndarray, float]:
+        """A camera's picture as `act` and `set_goal` take it, and the `zoom` for `act`.
+
+        Args:
+            picture: [H,W,3] uint8 RGB.
+            fov: of its shorter side [rad]; None: unknown, and taken for the policy's own.
+            zoom: that it has to have, for a goal picture of another camera than the robot's;
+                None: what the camera gives.
+
+        Raises:
+            UserError: see `vn_nav.observation.preprocess` and `through_lens`.
+        """
+        if self.search is None or fov is None:
+            return preprocess(picture, self.size, fov=fov, target_fov=self.camera_fov), 1.0
+        return through_lens(picture, self.size, fov=fov, target_fov=self.camera_fov, zoom=zoom)
+
     def reset(self) -> None:
         """Begin an episode: empty memory, no last action."""
         if self.search is None:
@@ -159,7 +198,8 @@ class PolicyRuntime:
         return self.stop_threshold is not None and self.arrival > self.stop_threshold
 
     @torch.inference_mode()
-    def act(self, image: np.ndarray, odometry: np.ndarray | None = None) -> int:
+    def act(self, image: np.ndarray, odometry: np.ndarray | None = None,
+            scan: Scan | None = None, zoom: float = 1.0) -> int:
         """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
@@ -171,6 +211,9 @@ class PolicyRuntime:
                 the same until `reset_odometry`, `reset` or `set_goal`; what counts is how it
                 changes. None: unknown at this picture; the frame stays. Of use to a policy that
                 searches alone.
+            scan: ranges that were measured there, which its map takes in place of those that it
+                sees in the picture. None: there are none at this picture.
+            zoom: of picture and goal, as `prepare` says.
 
         Raises:
             FloatingPointError: the outputs are not finite; memory and last action stay.
@@ -183,7 +226,7 @@ class PolicyRuntime:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
         if self.search is not None:
-            return self._search_on(picture, odometry)
+            return self._search_on(picture, odometry, scan, zoom)
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -205,12 +248,14 @@ class PolicyRuntime:
             self.reset()
         return action
 
-    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None) -> int:
+    def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, scan: Scan | None,
+                   zoom: float) -> int:
         """`act` of a policy that searches."""
         assert self.search is not None and self._goal_maps is not None
         action = int(self.search.act(
             picture.numpy(), self._goal_maps, np.array([self._last_action]),
-            np.array([self._starts]), None if odometry is None else odometry[None])[0])
+            np.array([self._starts]), None if odometry is None else odometry[None], [scan],
+            zoom)[0])
         self.arrival = float(self.search.arrival[0])
         self._last_action, self._starts = action, False
         if self.arrived:
@@ -234,6 +279,9 @@ class BatchedPolicy:
         num_envs: environments N.
         decoding: 'sample' or 'greedy'.
         seed: of the sampled actions.
+        zoom: how many times the robots' lens magnifies against the policy's, for one that
+            searches; see `vn_nav.policy.search.lens`.
+        scanner: what measures the `scan` of observations, if the robots have one.
 
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
@@ -244,9 +292,11 @@ class BatchedPolicy:
             changed the action; None where the policy has none.
     """
 
-    def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0):
+    def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0,
+                 scanner: Scanner | None = None, zoom: float = 1.0):
         _check_decoding(decoding)
-        self.network, self.decoding = network, decoding
+        self.network, self.decoding, self.scanner = network, decoding, scanner
+        self._zoom = zoom
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self.logits: torch.Tensor | None = None
@@ -272,7 +322,8 @@ class BatchedPolicy:
             obs: `image` [N,3,S,S] uint8, `goal_index` [N], `last_action` [N], `last_reward` [N];
                 `features` [N,F] float32, if somebody has computed them, see `takes_features`;
                 `odometry` [N,3] float64, if the robots have it: x, y [m], yaw [rad] in a frame of
-                the episode (a network that does not use it ignores it).
+                the episode (a network that does not use it ignores it); `scan` [N,K] float32 m,
+                ranges along the bearings of the `scanner`, for the map of a policy that has one.
             goals: [G,3,S,S] uint8, or their features [G,F] float32; encoded again only when
                 another array is passed, so do not write into one.
             reset_mask: [N] bool, where an episode begins with this observation.
@@ -294,8 +345,10 @@ class BatchedPolicy:
                                   torch.from_numpy(np.asarray(obs['goal_index'])))
         last_action, reset_mask = np.asarray(obs['last_action']), np.asarray(reset_mask, bool)
         if self.search is not None:
+            scans = None if self.scanner is None else [
+                Scan(self.scanner, ranges) for ranges in obs['scan']]
             chosen = self.search.act(obs['image'], maps, last_action, reset_mask,
-                                     obs.get('odometry'))
+                                     obs.get('odometry'), scans, self._zoom)
             self.arrival = self.search.arrival.copy()
             return chosen
         observation = Observation(

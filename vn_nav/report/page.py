@@ -51,7 +51,9 @@ figure { margin:18px 0 } svg { width:100%; height:auto; max-height:640px; backgr
 .journey h3 { margin:0 0 6px; font-size:1rem } .yes { color:var(--good) } .no { color:var(--bad) }
 .maps { display:grid; grid-template-columns:repeat(auto-fill, minmax(310px, 1fr)); gap:16px }
 .maps figure { margin:0 } .maps figcaption { font-size:.85rem; padding:4px 2px }
-.maps svg text { font-size:20px }
+.maps svg text { font-size:20px } .maps.searched { grid-template-columns:1fr }
+.searched figure > div { display:grid; grid-template-columns:1fr 1fr; gap:12px }
+.searched img { width:100%; border-radius:4px }
 .wide { overflow-x:auto }
 table { border-collapse:collapse; font-size:.9rem; width:100%; font-variant-numeric:tabular-nums }
 th, td { text-align:right; padding:5px 8px; border-bottom:1px solid var(--line);

@@ -33,8 +33,12 @@ STOP_COLUMNS: tuple[Column, ...] = (
     ('declared', lambda r: f'{r["declared"]:.2f}'),
     ('false stops', lambda r: f'{r["false_stops"]:.2f}'),
     ('reached', lambda r: f'{r["reached"]:.2f}'),
+    ('within 1 m (SPL)', lambda r: '-' if r['within_1m'] is None else
+     f'{r["within_1m"]:.2f} ({number(r["spl_within_1m"], ".2f")})'),
 )
-
+SHOWN_COLUMNS: tuple[Column, ...] = (  # where a row shows another picture than the goal's
+    ('at the picture', lambda r: number(r.get('stops_at_shown'), '.2f')),
+)
 
 FILTER_COLUMNS: tuple[Column, ...] = (  # where a row has an action filter
     ('filter acted', lambda r: f'{r["filter_acted"]:.1%}' if 'filter_acted' in r else '-'),
@@ -70,7 +74,11 @@ def place(split: str, scenes: Sequence[str], bag: str | None = None) -> str:
 
 
 def _columns(stop: str, rows: Iterable[dict]) -> tuple[Column, ...]:
-    columns = COLUMNS[:1] + STOP_COLUMNS + COLUMNS[1:] if stop == DECLARED else COLUMNS
+    rows = list(rows)
+    columns = COLUMNS
+    if stop == DECLARED:
+        shown = SHOWN_COLUMNS if any('stops_at_shown' in row for row in rows) else ()
+        columns = COLUMNS[:1] + STOP_COLUMNS + shown + COLUMNS[1:]
     return columns + (FILTER_COLUMNS if any('filter_acted' in row for row in rows) else ())
 
 

@@ -20,10 +20,11 @@ from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
 from vn_sim_bridge.datasets.lenses import Lenses, cut
 from vn_sim_bridge.datasets.pair_poses import PLACERS, TRIES, USUAL
-from vn_sim_bridge.datasets.view_ranges import ranges_of_depth, ray_cast
+from vn_sim_bridge.datasets.view_ranges import ranges_of_depth
 from vn_sim_bridge.floor.distance import FloorDistance
 from vn_sim_bridge.floor.floor_map import CELL, FloorMap
 from vn_sim_bridge.floor.places import FloorPlace, WalledPlace
+from vn_sim_bridge.floor.rays import ray_cast
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.simulator import Frames, Place, Setup
@@ -167,7 +168,9 @@ class PairSampler:
         if self._lenses is not None:
             fovs, shares, masts = self._lenses.draw(self._seed, numbers[::size], self.robot)
             off = (np.repeat(fovs - self.robot.camera_fov, size),
-                   np.repeat(masts - self.robot.camera_height, size))
+                   np.repeat(masts - self.robot.camera_height, size),
+                   self._lenses.pitches(self._seed, np.repeat(numbers[::size], size),
+                                        np.tile(np.arange(size), count)))
             zoom = np.repeat([zoom_of(own, self.robot.camera_fov) for own in fovs], size)
             aspects = np.repeat(shares, size)
         frames, (cameras, fov) = self._look(np.repeat(place[::robots], size), poses, numbers,
@@ -262,15 +265,16 @@ class PairSampler:
         return tasks.arrived(distance, error)
 
     def _look(self, place, poses, numbers, view: int | np.ndarray,
-              off: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Frames, tuple]:
+              off: tuple[np.ndarray, ...] | None = None) -> tuple[Frames, tuple]:
         """Pictures from poses, and the cameras that took them; `view` tells the two apart.
 
-        `off` is added to their fields of view [rad] and heights [m].
+        `off` is added to their fields of view [rad], heights [m] and pitches [rad].
         """
         appearance = self.simulator.appearance(self._seed, Stream.PAIR_APPEARANCE, numbers, view)
         if off is not None:
             appearance = appearance._replace(fov=appearance.fov + off[0],
-                                             height=appearance.height + off[1])
+                                             height=appearance.height + off[1],
+                                             pitch=appearance.pitch + off[2])
         frames = self.simulator.view(place, poses, None, appearance,
                                      key(self._seed, Stream.PAIR_SENSOR, numbers, view))
         return frames, self.simulator.cameras(poses, appearance)

@@ -23,16 +23,18 @@ from vn_sim_bridge.navigation.env_config import (
     EnvConfig,
     check_simulator,
     setup_for,
+    tells,
     with_own_actions,
 )
 from vn_sim_bridge.navigation.episode_odometry import EpisodeOdometry
+from vn_sim_bridge.navigation.episode_ranges import EpisodeRanges
 from vn_sim_bridge.navigation.episodes import draw_motion_scale, draw_variant
 from vn_sim_bridge.navigation.exploration import Exploration
 from vn_sim_bridge.navigation.goal_distances import FloorDistances, SeparateDistances
 from vn_sim_bridge.navigation.goal_views import GoalViews
 from vn_sim_bridge.navigation.make_task import make_task
 from vn_sim_bridge.navigation.seeds import Seeds, read_reset_mask
-from vn_sim_bridge.navigation.tasks import BLANK, RIGHT, WRONG
+from vn_sim_bridge.navigation.tasks import ABSENT, BLANK, RIGHT, WRONG
 from vn_sim_bridge.navigation.teachers import ExplorerTeacher, FloorTeacher
 from vn_sim_bridge.simulator import Frames, Motion, Simulator
 from vn_sim_bridge.simulators import open_simulator, robot_for
@@ -52,6 +54,10 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
     With `config.odometry` there is also `odometry` [N,3] float64: x, y [m], yaw [rad] as the
     robots' own odometry has them, in a frame of its own that begins at (0, 0, 0) with every
     episode: x ahead of where the robot starts, y to its left (see `EpisodeOdometry`).
+
+    With `config.ranges` other than `picture` there is also `scan` [N,K] float32 m: ranges along
+    the bearings of the attribute `scanner`, measured where the pictures are taken (see
+    `EpisodeRanges`). They are for the map of a policy that has one; no network is shown them.
 
     With `stop='declared'` arriving ends no episode. `step` then takes one more number,
     `declare_action`, which says "I have arrived": the robot stays where it is and the episode
@@ -106,6 +112,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
         self._base = BaseMotion(config, self.robot, exact_turns=self.simulator.exact_turns)
         self._odometry = None if config.odometry == 'none' else EpisodeOdometry(config.odometry, n)
+        self._ranges = None if config.ranges == 'picture' else EpisodeRanges(
+            config.ranges, self.simulator, self.robot, config.size)
+        self.scanner = None if self._ranges is None else self._ranges.scanner
         self._views = GoalViews(
             self.simulator, self.task.views, variants=config.pictures_per_goal, size=config.size,
             seed=config.seed,
@@ -143,7 +152,9 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'goal_pose', 'overlap', 'explorer_action'} else ()))
         self._explorer = (self._make_explorer_teacher() if 'explorer_action' in config.privileged
                           else None)
-        self._floor_teacher: FloorTeacher | None = None  # made when it is asked for
+        # Made when they are asked for.
+        self._floor_teacher: FloorTeacher | None = None
+        self._control: ExplorerTeacher | None = None
 
     @property
     def place_index(self) -> np.ndarray:
@@ -175,6 +186,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             **features,
             **({} if self._odometry is None else {
                 'odometry': spaces.Box(-np.inf, np.inf, (3,), np.float64)}),
+            **({} if self.scanner is None else {
+                'scan': spaces.Box(-np.inf, np.inf, (len(self.scanner.bearings),), np.float32)}),
         })
         self.single_action_space = spaces.Discrete(self._choices)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -216,9 +229,19 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self._tau = float(tau)
 
     def set_shown_goal(self, mode: str) -> None:
-        """Which picture later episodes show: 'right', 'wrong' (same place) or 'blank'."""
-        if mode not in (RIGHT, WRONG, BLANK):
-            raise UserError('the shown goal is right, wrong or blank', mode, 'choose one of them')
+        """Which picture later episodes show.
+
+        Args:
+            mode: 'right'; 'wrong', another one of the place; 'absent', one of another place, for
+                task image alone; or 'blank'.
+        """
+        if mode not in (RIGHT, WRONG, ABSENT, BLANK):
+            raise UserError('the shown goal is right, wrong, absent or blank', mode,
+                            'choose one of them')
+        if mode == ABSENT and (self.config.task != 'image' or len(self.places) < 2):
+            raise UserError('an absent goal needs the task image and at least two places',
+                            f'task {self.config.task}, {", ".join(self.config.scenes)}',
+                            'name more scenes')
         if mode == WRONG and min(count for _, count in self.task.ranges) < 2:
             raise UserError('a wrong goal needs a place with at least two goals',
                             ', '.join(self.config.scenes), 'use larger scenes')
@@ -454,6 +477,12 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
                                                               self.simulator.poses)
         if self._odometry is not None:
             observation['odometry'] = self._odometry.poses.copy()
+        if self._ranges is not None:
+            observation['scan'] = self._ranges.measure(
+                frames, self._counters(np.arange(self.num_envs)), self._step)
+        other, at_shown = self._views.other_shown(self._shown_goal, self._goal, self.place_index,
+                                                  self.simulator.poses)
+        self._seen_now = frames.depth, reset
         info = {
             'reset': reset,
             'success': success,
@@ -466,6 +495,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             'path_length': self._path_length.astype(np.float32),
             'decisions': self._step.copy(),
             'goal': self._goal.copy(),
+            'shown_other': other,
+            'at_shown': at_shown,
             'pose': self.simulator.poses.copy(),
         }
         if 'depth' in self.config.privileged:
@@ -486,11 +517,39 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             info['overlap'] = self._views.co_visibility(self._picture, self._shown_goal,
                                                         frames.depth)
         if self._explorer is not None:
-            assert isinstance(self._distances, FloorDistances)  # where there are walls is a floor
-            info['explorer_action'] = self._explorer.actions(
-                reset, self.simulator.poses, self.place_index, info['overlap'], self._distance,
-                self._goal_yaw, self._distances.maps, self._last_action)
+            info['explorer_action'] = self._explored(self._explorer, reset, info['overlap'])
         return observation, info
+
+    def _explored(self, teacher: ExplorerTeacher, reset: np.ndarray, overlap: np.ndarray
+                  ) -> np.ndarray:
+        assert isinstance(self._distances, FloorDistances)  # where there are walls is a floor
+        return teacher.actions(reset, self.simulator.poses, self.place_index, overlap,
+                               self._distance, self._goal_yaw, self._distances.maps,
+                               self._last_action)
+
+    @property
+    def explores(self) -> bool:
+        """Whether there are `explorer_actions`."""
+        return self.config.task == 'image' and 'explorer_action' in tells(self.simulator)
+
+    def explorer_actions(self) -> np.ndarray:
+        """The next action [N] of the explorer (see `explorer`), as a control.
+
+        It looks when it is asked: ask at every observation of an episode. Having arrived, declare
+        it where that ends an episode.
+        """
+        if self._control is None:
+            self._control = self._make_explorer_teacher()
+        depth, reset = self._seen_now
+        overlap = self._views.co_visibility(self._picture, self._shown_goal, depth)
+        return self._or_declared(self._explored(self._control, reset, overlap))
+
+    def _or_declared(self, actions: np.ndarray) -> np.ndarray:
+        """Actions [N], and the declared stop in place of those of robots that have arrived."""
+        if self.declare_action is None:
+            return actions
+        arrived = tasks.arrived(self._distance, self._heading_error())
+        return np.where(arrived, self.declare_action, actions)
 
     def oracle_actions(self) -> np.ndarray:
         """The next action [N] on a shortest path to the goal, from the simulator's geometry.
@@ -504,7 +563,6 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         if not (self.simulator.capabilities.geodesic or self.simulator.planner):
             raise UserError('the shortest-path action needs a simulator that knows ways',
                             self.simulator_name, 'use another control')
-        arrived = tasks.arrived(self._distance, self._heading_error())
         if self.simulator.planner is not None:
             actions = self.simulator.planner.actions(self.simulator.poses,
                                                      self.goal_poses[self._goal])
@@ -515,8 +573,7 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             actions = self._floor_teacher.actions(
                 self.simulator.poses, self._goal_yaw, near, self.simulator.reach,
                 self._distance_from)
-        return actions if self.declare_action is None else np.where(
-            arrived, self.declare_action, actions)
+        return self._or_declared(actions)
 
 
 def _paid(motion: Motion | None, driving: np.ndarray, verdict: tasks.Judgement

@@ -24,6 +24,7 @@ OPTIONAL = {'progress_reward': 'the simulator knows no driving distances, or pay
             'randomisation': 'light and camera do not vary in this simulator'}
 STOPS = ('arrival', 'declared')
 ODOMETRIES = ('none', 'true', 'drift', 'commanded')  # see `episode_odometry.EpisodeOdometry`
+RANGES = ('picture', 'scan', 'depth')  # see `episode_ranges.EpisodeRanges`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +59,7 @@ class EnvConfig:
     goal_seed: int = 0  # 0: the scenes' own goals, else other ones in the same scenes
     exploration_reward: float = 0.0  # per square of floor that is new to the episode, see SQUARE
     odometry: str = 'none'  # of ODOMETRIES: what the robots observe of their own motion
+    ranges: str = 'picture'  # of RANGES: what a policy's map is given; 'picture': nothing
 
     def __post_init__(self):
         one_simulator(self.scenes)
@@ -77,6 +79,7 @@ class EnvConfig:
             (self.goal_seed >= 0, 'the seed of goals is not negative', self.goal_seed),
             (self.odometry in ODOMETRIES, f'the odometry is one of {", ".join(ODOMETRIES)}',
              self.odometry),
+            (self.ranges in RANGES, f'the ranges are one of {", ".join(RANGES)}', self.ranges),
         )
         for kept, rule, received in rules:
             if not kept:
@@ -193,6 +196,12 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
          robot.action_names),
         (config.odometry == 'none' or not can.own_actions,
          'odometry needs robots that move in metres; there it is none', config.odometry),
+        (config.ranges == 'picture' or not can.own_actions,
+         'ranges are measured by robots that move in metres', config.ranges),
+        (config.ranges != 'scan' or can.walls, 'a scan needs a simulator that knows walls',
+         'none'),
+        (config.ranges != 'depth' or can.depth, 'ranges by depth need a simulator that has depth '
+         'pictures', 'none'),
         (can.geodesic or not config.progress_reward,
          'progress_reward needs a simulator that knows ways', config.progress_reward),
         (not can.rewards or not config.progress_reward,

@@ -8,6 +8,7 @@ episode).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -31,6 +32,20 @@ def draw_goal(count: int, seed: int, env, episode) -> int:
 def draw_wrong_goal(count: int, right: int, seed: int, env, episode) -> int:
     """Another goal of the same place, for the wrong-goal control."""
     return (right + 1 + draw_index(count - 1, seed, Stream.WRONG_GOAL, env, episode)) % count
+
+
+def draw_absent_goal(ranges: Sequence[tuple[int, int]], place: int, seed: int, env, episode
+                     ) -> int:
+    """A view of another place, for a goal that is nowhere here.
+
+    Args:
+        ranges: first view and number of goals, by place; at least two places.
+        place: where the robot is.
+        seed, env, episode: counter of the random numbers.
+    """
+    others = [own for other, own in enumerate(ranges) if other != place and own[1]]
+    first, count = others[draw_index(len(others), seed, Stream.WRONG_GOAL, env, episode, 1)]
+    return first + draw_index(count, seed, Stream.WRONG_GOAL, env, episode, 2)
 
 
 def draw_variant(count: int, seed: int, env, episode) -> int:

@@ -32,6 +32,7 @@ from vn_sim_bridge.floor.places import RoomPlace
 from vn_sim_bridge.navigation.episodes import (
     GoalField,
     Starts,
+    draw_absent_goal,
     draw_goal,
     draw_index,
     draw_wrong_goal,
@@ -43,7 +44,8 @@ COLLECT_RADIUS = 0.45  # m, straight: the robot's rim touches the fruit
 VISIBLE_SHARE = 0.045  # of the picture that shows the room's objects (House3D)
 VISIBLE_STEPS = 2  # decisions in a row
 FIELDS_KEPT = 512  # of `ImageGoal`, 0.1 MB each; a thousand others take 0.7 s to solve again
-RIGHT, WRONG, BLANK = 'right', 'wrong', 'blank'
+# Goal pictures to show: the goal's; of another goal of the place; of another place; plain grey.
+RIGHT, WRONG, ABSENT, BLANK = 'right', 'wrong', 'absent', 'blank'
 
 # What tells a room's type, for the rule of House3D's code.
 ROOM_OBJECTS = {
@@ -175,8 +177,12 @@ class _Pool:
         """The true goal's view and the shown one (-1: blank)."""
         first, count = self.ranges[place]
         local = draw_goal(count, *counter) if fixed is None else fixed % count
-        shown = draw_wrong_goal(count, local, *counter) if mode == WRONG else local
-        return first + local, -1 if mode == BLANK else first + shown
+        shown = first + local
+        if mode == WRONG:
+            shown = first + draw_wrong_goal(count, local, *counter)
+        elif mode == ABSENT:
+            shown = draw_absent_goal(self.ranges, place, *counter)
+        return first + local, -1 if mode == BLANK else shown
 
     def nothing_removed(self, situation: Situation) -> np.ndarray:
         """[N,M] of False."""

@@ -69,6 +69,9 @@ class WarpNavigationEnv:
         if config.odometry != 'none':
             raise UserError('robots on the device have no odometry', config.odometry,
                             'use NavigationEnv (--device cpu), or odometry none')
+        if config.ranges != 'picture':
+            raise UserError('robots on the device measure no ranges', config.ranges,
+                            'use NavigationEnv (--device cpu), or ranges picture')
         if teachers := sorted(set(config.privileged) & set(TEACHERS)):
             raise UserError('teachers plan on the CPU: the device tells no actions to imitate',
                             ', '.join(teachers), 'set imitation=0 and teacher_share=0 (--set '

@@ -10,6 +10,8 @@ import math
 
 import numpy as np
 
+from vn_sim_bridge.floor.rays import ray_cast
+
 RAYS = 360  # over the full turn
 NEAREST, FARTHEST = 0.05, 12.0  # m, what the scanner measures
 
@@ -30,19 +32,12 @@ def scan(rects: np.ndarray, pose: np.ndarray) -> np.ndarray:
         Infinity where nothing is within `FARTHEST`, as REP 117 wants it; negative infinity for
         what is nearer than `NEAREST`.
     """
-    angles = pose[2] + scan_angles()
-    with np.errstate(divide='ignore'):  # a ray along an axis never reaches the other one's sides
-        inverse = 1.0 / np.stack([np.cos(angles), np.sin(angles)])
-    # A ray is inside a rectangle where it is between both pairs of sides (the slab method).
-    enter, leave = np.full((RAYS, len(rects)), -np.inf), np.full((RAYS, len(rects)), np.inf)
-    for axis in (0, 1):
-        with np.errstate(invalid='ignore'):
-            low = (rects[:, axis] - pose[axis]) * inverse[axis][:, None]
-            high = (rects[:, axis + 2] - pose[axis]) * inverse[axis][:, None]
-        enter = np.fmax(enter, np.fmin(low, high))
-        leave = np.fmin(leave, np.fmax(low, high))
-    hit = (leave >= enter) & (leave >= 0)
-    ranges = np.where(hit, np.maximum(enter, 0.0), np.inf).min(axis=1, initial=np.inf)
+    return limited(ray_cast(pose[None], np.zeros(1, np.int64), scan_angles(),
+                            np.asarray(rects, float), np.array([0, len(rects)]))[0])
+
+
+def limited(ranges: np.ndarray) -> np.ndarray:
+    """Ranges as the scanner gives them, see `scan`; the array is changed."""
     ranges[ranges > FARTHEST] = np.inf
     ranges[ranges < NEAREST] = -np.inf
-    return ranges.astype(np.float32)
+    return ranges

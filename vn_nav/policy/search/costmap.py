@@ -14,7 +14,7 @@ from vn_nav.policy.search.grid import CELL, OccupancyGrid
 KEEP = 0.04  # m beyond the footprint that is passable: a cell's edge is half a cell off
 KEEP_OFF = 0.2  # m beyond the footprint within which a way costs more
 CLOSE_COST = 2.0  # of it: this many metres more for a metre, at the footprint
-UNKNOWN_COST = 2.0  # the same for floor that nobody has seen
+UNKNOWN_COST = 2.0  # the same for floor that nobody has seen or measured
 ASIDE_COST = 0.5  # where a robot has driven: for a metre beside that
 WALL_COST = 30.0  # for a wall that is known by hearsay
 ROOM = 0.7  # m about a frontier cell in which the unknown floor counts
@@ -30,29 +30,33 @@ class Costmap:
     Args:
         grid: the map.
         off: m by which obstacles are passed closer than the footprint, where all else failed.
+        felt: what the robot has touched counts as well.
 
     Attributes:
         clearance: [SIDE,SIDE] m to the nearest obstacle.
         passable: [SIDE,SIDE] bool: the robot's centre may be here.
-        unknown: [SIDE,SIDE] bool.
+        unknown: [SIDE,SIDE] bool: nobody has looked there; uncharted: [SIDE,SIDE] bool: nor has
+            anybody measured.
         cost: [SIDE,SIDE] float32 of a metre; 0 where it is not passable.
     """
 
-    def __init__(self, grid: OccupancyGrid, off: float = 0.0):
+    def __init__(self, grid: OccupancyGrid, off: float = 0.0, felt: bool = True):
         self.grid = grid
         obstacles = grid.obstacles()
+        if not felt:
+            obstacles &= ~grid.contacts
         self.clearance = CELL * cv2.distanceTransform(
             (~obstacles).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         limit = grid.footprint + (KEEP if off == 0 else -off)
-        self.unknown = grid.unknown()
+        self.unknown, self.uncharted = grid.unknown(), grid.uncharted()
         self.passable = (self.clearance > limit) | grid.been
         close = np.clip((limit + KEEP_OFF - self.clearance) / KEEP_OFF, 0, 1)
-        price = 1 + CLOSE_COST * close + UNKNOWN_COST * self.unknown
+        price = 1 + CLOSE_COST * close + UNKNOWN_COST * self.uncharted
         heard = grid.heard_of()
         if heard is not None:
-            # Where a robot has driven is the surest way, surer than what this one sees. Where it has
-            # only seen floor is none: there may be a wall that its eyes missed. Its walls lie a little off, and would close
-            # doors: they cost, and are obstacles when this robot sees them.
+            # Where a robot has driven is the surest way, surer than what this one sees. Where it
+            # has only seen floor is none: there may be a wall that its eyes missed. Its walls lie
+            # a little off, and would close doors: they cost, and block nothing.
             lane, wall, floor = heard
             self.passable |= lane
             price = np.where(lane, 1, price + ASIDE_COST + UNKNOWN_COST * floor + WALL_COST * wall)
@@ -75,12 +79,12 @@ class Costmap:
         Args:
             cells: [K,2]; costs: [K] m that each adds.
             here: the robot's cell.
-            through_unknown: also over floor that nobody has seen.
+            through_unknown: also over floor that nobody has seen or measured.
 
         Returns:
             [SIDE,SIDE] float32 m, inf where there is no way or nobody asked.
         """
-        price = self.cost if through_unknown else np.where(self.unknown, 0, self.cost)
+        price = self.cost if through_unknown else np.where(self.uncharted, 0, self.cost)
         return _dijkstra(price, cells.astype(np.int64), costs.astype(np.float64), here[0], here[1])
 
     def free_length(self, pose: np.ndarray, angle: float, length: float) -> tuple[float, float]:
@@ -89,7 +93,7 @@ class Costmap:
         Args:
             pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
         """
-        return _free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
+        return free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
                             float(pose[1]), angle, length)
 
 
@@ -135,7 +139,8 @@ def _dijkstra(price, cells, costs, row0, column0):
 
 
 @numba.njit(cache=True)
-def _free_length(passable, clearance, origin, x, y, angle, length):
+def free_length(passable, clearance, origin, x, y, angle, length):
+    """`Costmap.free_length`, for other kernels."""
     side = passable.shape[0]
     dx, dy = math.cos(angle), math.sin(angle)
     count = max(int(math.ceil(length / (0.5 * CELL))), 1)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from vn_nav.measured_ranges import Scan, laser_scan
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
+from vn_nav.policy.search.lens import SAME, bearings_through, in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.recall import Recall
@@ -33,7 +36,7 @@ class SearchDriver:
     def __init__(self, network: SearchPolicy, num_envs: int, rules: Rules | None = None):
         config = network.config
         self.network = network
-        bearings = column_bearings(config.view)
+        self._bearings = bearings = column_bearings(config.view)
         self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint, rules)
                           for _ in range(num_envs)]
         place = network.taught
@@ -53,6 +56,7 @@ class SearchDriver:
                           np.array([1.0, 0.0]), 0.3, np.array([1.0, 0.0]), co_visible, 0.0)
             for action in (-1, int(np.argmax(searcher.moves[:, 0]))):  # the second meets something
                 searcher.step(sight, action, np.zeros(3))
+            searcher.step(sight, -1, np.zeros(3), scan=laser_scan(np.ones(4), 0.0, 1.0, 0.1, 2.0))
 
     def prepare(self, goal_maps: Tensor) -> None:
         """Look for a goal [1,...] in the taught place now, so that the first `act` need not."""
@@ -66,7 +70,8 @@ class SearchDriver:
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
-            starts: np.ndarray, odometry: np.ndarray | None) -> np.ndarray:
+            starts: np.ndarray, odometry: np.ndarray | None,
+            scans: Sequence[Scan | None] | None = None, zoom: float = 1.0) -> np.ndarray:
         """Actions [N] int64.
 
         Args:
@@ -75,6 +80,8 @@ class SearchDriver:
             last_action: [N], -1: none.
             starts: [N] bool, where an episode begins: map and hypotheses are empty.
             odometry: [N,3] x, y [m], yaw [rad]; None: nobody has any.
+            zoom: how many times the lens of pictures and goals magnifies, see `lens`.
+            scans: [N] measured ranges; None: of nobody, or not of this robot at this picture.
 
         Raises:
             FloatingPointError: what the networks say is not finite.
@@ -83,7 +90,8 @@ class SearchDriver:
         look = self.network.look(pictures, goal_maps)
         if not all(torch.isfinite(part).all() for part in look):
             raise FloatingPointError('what the policy sees is not finite')
-        sights = sights_of(look)
+        sights = sights_of(in_metres(look, self._bearings, zoom))
+        bearings = bearings_through(self._bearings, zoom)
         small = thumbnails(image)
         still = (np.zeros(len(image), bool) if self._before is None
                  else np.abs(small - self._before).mean(1) < UNCHANGED_GREY_LEVELS)
@@ -93,14 +101,16 @@ class SearchDriver:
             if starts[n]:
                 searcher.reset()
             recall = None
-            if self.recalls is not None and self._keys is not None:
+            if self.recalls is not None and self._keys is not None and abs(zoom - 1) < SAME:
                 own = self.recalls[n]
                 if starts[n]:
                     own.begin(self._poses_of_goal(self._keys, goal_maps[n:n + 1]))
                 recall = functools.partial(own.look, image=pictures[n:n + 1])
+            searcher.bearings = bearings
             actions[n] = searcher.step(sight, -1 if starts[n] else int(last_action[n]),
                                        None if odometry is None else odometry[n],
-                                       unmoved=bool(still[n]) and not starts[n], recall=recall)
+                                       unmoved=bool(still[n]) and not starts[n],
+                                       scan=None if scans is None else scans[n], recall=recall)
             self.arrival[n] = searcher.arrival
         return actions
 

@@ -14,10 +14,14 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from vn_nav.measured_ranges import Scan
+from vn_nav.policy.search.measured import enter_scan, look_over
+
 CELL = 0.1  # m
 SIDE = 320  # cells
 MARGIN = 60  # cells from the edge at which the map is moved
 REACH = 3.5  # m: ranges beyond tell nothing about cells
+SCAN_REACH = 6.0  # m: the same for measured ranges
 SUB_RAYS = 3  # a column of the picture
 FREE_WEIGHT, HIT_WEIGHT = 0.9, 3.0  # log-odds of a ray that passes, and of one that ends here
 MOST = 4.0  # log-odds either way
@@ -46,6 +50,7 @@ class OccupancyGrid:
     Attributes:
         log_odds: [SIDE,SIDE] float32, rows along y.
         seen: [SIDE,SIDE] float32: looks that passed or ended here, in expectation.
+        measured: [SIDE,SIDE] bool: a scan passed or ended here, whoever has looked.
         missed: [SIDE,SIDE] int16: looks that should have shown it, by the map, and did not.
         stood: [SIDE,SIDE] bool: the robot was on it; been: its centre was.
         contacts: [SIDE,SIDE] bool: it met something here.
@@ -58,6 +63,7 @@ class OccupancyGrid:
         self.footprint = footprint
         self.log_odds = np.zeros((side, side), np.float32)
         self.seen = np.zeros((side, side), np.float32)
+        self.measured = np.zeros((side, side), bool)
         self.missed = np.zeros((side, side), np.int16)
         self.stood = np.zeros((side, side), bool)
         self.been = np.zeros((side, side), bool)
@@ -84,6 +90,29 @@ class OccupancyGrid:
                    np.asarray(edges, float))
         _expect(self.unknown(), self.obstacles(), self.missed, self.origin, pose[0], pose[1],
                 pose[2] + np.asarray(bearings, float), True)
+
+    def add_scan(self, pose: np.ndarray, scan: Scan, bearings: np.ndarray) -> None:
+        """Enter measured ranges, and that a camera looks at what is known by them.
+
+        A scanner may see all around: where something stands. The goal is found where the camera
+        looks, and so `seen` grows along its columns alone.
+
+        Args:
+            pose: [3] x, y [m], yaw [rad] of the robot.
+            scan: from there.
+            bearings: [C] rad of the picture's columns.
+        """
+        self._follow(pose)
+        scanner = scan.scanner
+        at = on_robot(pose, scanner.mount)
+        enter_scan(self.log_odds, self.measured, self.origin, CELL, at, scanner.bearings,
+                   scan.ranges.astype(float), scanner.nearest, scanner.clear_from,
+                   min(scanner.farthest, SCAN_REACH), FREE_WEIGHT, HIT_WEIGHT, MOST)
+        angles = pose[2] + np.asarray(bearings, float)
+        look_over(self.seen, self.measured, self.obstacles(), self.origin, CELL, pose[0], pose[1],
+                  angles, REACH, SUB_RAYS)
+        _expect(self.unknown(), self.obstacles(), self.missed, self.origin, pose[0], pose[1],
+                angles, True)
 
     def look_gains(self, pose: np.ndarray, headings: np.ndarray, bearings: np.ndarray
                    ) -> np.ndarray:
@@ -151,6 +180,17 @@ class OccupancyGrid:
         wall = other & ~lane & (self.prior.log_odds > OCCUPIED)
         return lane, wall, other & ~lane & ~wall & (self.prior.seen >= KNOWN)
 
+    def occupancy(self) -> np.ndarray:
+        """[SIDE,SIDE] int8: percent of an obstacle, -1: nothing is known."""
+        percent = np.round(100 / (1 + np.exp(-self.log_odds.astype(float)))).astype(np.int8)
+        known = (self.seen >= KNOWN) | self.measured
+        return np.where(self.contacts, 100, np.where(
+            self.stood, 0, np.where(known, percent, -1))).astype(np.int8)
+
+    def uncharted(self) -> np.ndarray:
+        """[SIDE,SIDE] bool: nobody knows whether something stands there."""
+        return self.unknown() & ~self.measured
+
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """Row and column of a place; outside, of the nearest cell."""
         column, row = ((np.array([x, y]) - self.origin) / CELL).astype(int)
@@ -164,7 +204,7 @@ class OccupancyGrid:
         if MARGIN <= row < side - MARGIN and MARGIN <= column < side - MARGIN:
             return
         shift = np.array([column, row]) - side // 2
-        for name in ('log_odds', 'seen', 'missed', 'stood', 'been', 'contacts'):
+        for name in ('log_odds', 'seen', 'measured', 'missed', 'stood', 'been', 'contacts'):
             old = getattr(self, name)
             new = np.zeros_like(old)
             rows, columns = (np.arange(side) + s for s in shift[::-1])
@@ -174,6 +214,13 @@ class OccupancyGrid:
             setattr(self, name, new)
         self.origin = self.origin + CELL * shift
         self.prior = None
+
+
+def on_robot(pose: np.ndarray, mount: tuple[float, float, float]) -> np.ndarray:
+    """Pose [3] on the map of what sits on a robot at a pose [3]."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y, yaw = mount
+    return np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y, pose[2] + yaw])
 
 
 @numba.njit(cache=True)

@@ -17,7 +17,8 @@ MISS_M, MISS_RAD = 1.3, math.radians(35)  # seen from so near, the goal would be
 MISS_BELOW = 0.35  # co-visibility that refutes there
 WEIGHT_MOST = 200.0
 PROGRESS_M, PATIENCE = 0.2, 12  # decisions in which a way has to become shorter by so much
-AGAIN = 1.5  # times as much evidence is asked after each attempt in vain
+AGAIN = 3.0  # times as much evidence is asked after each attempt in vain
+LIKELY = 0.1  # probability of having arrived under which a look says that it is not here
 FORGET = 0.1  # weight under which a hypothesis is dropped
 
 
@@ -30,6 +31,8 @@ class Hypothesis:
         weight: evidence: sum of odds over distance.
         precision: of the position [1/m^2], of the votes together.
         refuted: how often the robot stood at it, or was on its way there, in vain.
+        doubted: looks in a row, standing there, that did not say so.
+        likeliest: the highest probability of having arrived, of these looks.
         nearest: the least cost to go on the way there [m]; waited: decisions since then.
     """
 
@@ -39,6 +42,8 @@ class Hypothesis:
     refuted: int = 0
     nearest: float = math.inf
     waited: int = 0
+    doubted: int = 0
+    likeliest: float = 0.0
 
     def is_stuck(self, cost: float) -> bool:
         """Whether the robot, on its way here at a cost, has come no nearer for too long."""
@@ -102,7 +107,8 @@ class Hypotheses:
     def refute(self, own: Hypothesis) -> None:
         """The robot stood there, and it was not the goal; or it did not get there."""
         own.refuted += 1
-        own.weight *= 0.25
+        own.weight *= 0.25 if own.likeliest > LIKELY else 0.02
+        own.likeliest = 0.0
 
     def worth_trying(self, least: float) -> list[Hypothesis]:
         """Those with enough evidence, the best first; after each attempt in vain more is asked.
@@ -133,7 +139,7 @@ class Hypotheses:
         own.pose[:2] += gain * (pose[:2] - own.pose[:2])
         own.pose[2] = wrap_angle(own.pose[2] + gain * wrap_angle(pose[2] - own.pose[2]))
         own.precision = min(own.precision + precision, 400.0)
-        own.weight = min(own.weight + weight, WEIGHT_MOST)
+        own.weight = min(own.weight + weight / (1 + own.refuted), WEIGHT_MOST)
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:

@@ -12,12 +12,20 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from vn_nav.arrival import wrap_angle
+from vn_nav.measured_ranges import Scan
+from vn_nav.policy.search.approach import best_move
 from vn_nav.policy.search.costmap import ROOM, Costmap
 from vn_nav.policy.search.grid import OccupancyGrid
-from vn_nav.policy.search.hypotheses import Hypotheses, Hypothesis, apart
+from vn_nav.policy.search.hypotheses import MISS_BELOW, Hypotheses, Hypothesis, apart
+from vn_nav.policy.search.lookahead import best_turns, cost_at
 
 # Decisions of exploring that show less new floor than this: where it leads there is none.
 IDLE, IDLE_M2 = 12, 0.5
+# So many decisions within so little space, and hardly any new floor: stuck.
+STUCK, STUCK_M, STUCK_M2 = 24, 0.9, 1.0
+TIGHT = 0.08  # m that obstacles are passed closer then
+FORGET_EVERY = 60  # decisions
+IN_VAIN = 2.5  # contacts of late: what it explores is out of reach
 BLOCKED_M, BLOCKED_RAD = 0.2, math.radians(20)  # a contact is remembered about its place
 
 
@@ -26,8 +34,10 @@ class Rules:
     """Numbers of the decisions, fitted on training houses."""
 
     follow_from: float = 2.0  # evidence of a hypothesis that the robot drives to
-    reached_m: float = 0.4  # so near a hypothesis it turns to its heading
-    reached_rad: float = math.radians(18)
+    near_m: float = 1.2  # so near a hypothesis place and heading are planned together
+    near_worth: float = 0.3  # probability, less the price of the way, that makes it worth it
+    decision_price: float = 0.03  # as a probability of having arrived
+    looks_in_doubt: float = 2  # where the robot stands on a hypothesis, and has not arrived
     turn_cost: float = 0.05  # m that a turn is worth
     look_cost: float = 0.12  # m that a turn to look is worth
     look_worth: float = 0.6  # m that a square metre of unknown floor in view is worth
@@ -78,6 +88,7 @@ class Searcher:
         self._right = int(np.argmin(np.where(still, self.moves[:, 2], np.inf)))
         self._turn = float(self.moves[self._left, 2])
         self._drives = np.flatnonzero(~still)
+        self._ahead = int(np.argmax(self.moves[:, 0]))
         self.reset()
 
     def reset(self) -> None:
@@ -86,13 +97,18 @@ class Searcher:
         self.hypotheses = Hypotheses()
         self.pose = np.zeros(3)
         self.aim, self.arrival = 'look', 0.0
+        self.seen: Sight | None = None
         self._last = -1
         self._odometry: np.ndarray | None = None
         self._known: list[float] = []  # m^2, at the decisions of exploring
         self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
+        self._track: list[tuple[float, float, float]] = []  # x, y [m], m^2 known: the last ones
+        self._contacts = 0.0  # of late, while it explored
+        self._decisions, self._forgot, self._stuck_for = 0, -FORGET_EVERY, 0
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
-             unmoved: bool = False, recall: Callable[[Searcher], None] | None = None) -> int:
+             unmoved: bool = False, scan: Scan | None = None,
+             recall: Callable[[Searcher], None] | None = None) -> int:
         """The next action.
 
         Args:
@@ -100,14 +116,19 @@ class Searcher:
             last_action: what was done before it; -1: nothing.
             odometry: [3] pose, if the robot has odometry; what counts is how it changes.
             unmoved: without odometry: the picture is as before the action.
+            scan: measured where the picture was taken: the map takes it in place of the ranges
+                that are seen.
             recall: brings to mind what is known of the place; called before the decision.
         """
         self._move(last_action, odometry, unmoved)
         self.grid.add_footprint(self.pose)
-        self.grid.add_ranges(self.pose, self.bearings, sight.ranges, self.edges)
+        if scan is None or np.isnan(scan.ranges).all():
+            self.grid.add_ranges(self.pose, self.bearings, sight.ranges, self.edges)
+        else:
+            self.grid.add_scan(self.pose, scan, self.bearings)
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
-        self.arrival = sight.arrived
+        self.arrival, self.seen = sight.arrived, sight
         if recall is not None:
             recall(self)
         action = self._decide()
@@ -141,6 +162,7 @@ class Searcher:
                 direction = before[2] + math.atan2(move[1], move[0])
                 self.grid.add_contact(self.pose, direction)
                 self._blocked.append(np.array([*self.pose[:2], direction]))
+                self._contacts += 1
 
     def _decide(self) -> int:
         costmap = Costmap(self.grid)
@@ -149,34 +171,51 @@ class Searcher:
             action = self._follow(own, costmap, here)
             if action is not None:
                 return action
-        action = self._explore(costmap, here)
+        # Where nothing is left to see, or the robot is stuck, it passes obstacles closer.
+        self._watch()
+        if not self._stuck_for:
+            action = self._explore(costmap, here)
+            if action is not None:
+                return action
+        tight = Costmap(self.grid, off=TIGHT)
+        action = self._explore(tight, here, look=False)
         if action is not None:
             return action
         # All is seen: take the best guess, then look at everything again.
         best = self.hypotheses.best()
         if best is not None and (action := self._follow(best, costmap, here)) is not None:
             return action
-        self.grid.forget_looks()
         self.aim = 'lost'
-        tight = Costmap(self.grid, off=0.08)
-        action = self._explore(tight, here)
-        if action is not None:
-            return action
-        return self._away(tight)
+        if self._decisions - self._forgot >= FORGET_EVERY:
+            self._forgot = self._decisions
+            self.grid.forget_looks()
+        return self._away(Costmap(self.grid, off=TIGHT, felt=False))
+
+    def _watch(self) -> None:
+        """Notice that the robot has been about one place for too long and has seen nothing new."""
+        self._decisions += 1
+        self._contacts *= 0.95
+        self._stuck_for = max(self._stuck_for - 1, 0)
+        self._track.append((*self.pose[:2], self.grid.known_area()))
+        if len(self._track) < STUCK:
+            return
+        track = np.array(self._track)
+        spread = np.ptp(track[:, :2], axis=0).max()
+        if spread < STUCK_M and track[-1, 2] - track[0, 2] < STUCK_M2:
+            self._stuck_for = STUCK
+            self._blocked = self._blocked[-2:]
+        self._track.pop(0)
 
     def _follow(self, own: Hypothesis, costmap: Costmap, here: tuple[int, int]) -> int | None:
         """Towards a hypothesis; None: there is no way, or the robot has been there."""
         gap, _ = apart(self.pose, own.pose)
-        if gap <= self.rules.reached_m:
-            turn = wrap_angle(float(own.pose[2] - self.pose[2]))
-            if own.is_stuck(0.0):
-                self.hypotheses.refute(own)
-                return None
-            if abs(turn) > self.rules.reached_rad and abs(turn) > 0.55 * self._turn:
-                self.aim = 'turn'
-                return self._left if turn > 0 else self._right
-            self.hypotheses.refute(own)  # it stands there, and it was not said to have arrived
-            return None
+        if gap <= self.rules.near_m:
+            move, worth = self._approach(own, costmap)
+            if worth >= self.rules.near_worth:
+                if move >= 0:
+                    self.aim = 'approach'
+                    return move
+                return self._doubt(own)
         row, column = self.grid.cell(*own.pose[:2])
         reach = 5
         rows, columns = np.mgrid[row - reach:row + reach + 1, column - reach:column + reach + 1]
@@ -194,14 +233,41 @@ class Searcher:
         self.aim = 'follow'
         return self._drive(field, costmap)
 
-    def _explore(self, costmap: Costmap, here: tuple[int, int]) -> int | None:
-        """Towards unknown floor, or a turn that shows some."""
+    def _approach(self, own: Hypothesis, costmap: Costmap) -> tuple[int, float]:
+        """The move that brings the robot onto a near hypothesis, and what that is worth."""
+        yaw = self.pose[2]
+        ways = yaw + np.arctan2(self.moves[:, 1], self.moves[:, 0])
+        still = np.hypot(self.moves[:, 0], self.moves[:, 1]) < 1e-6
+        is_open = np.array([bool(s) or not self._is_blocked(angle)
+                            for s, angle in zip(still, ways, strict=True)])
+        move, worth = best_move(costmap.passable, costmap.clearance, self.grid.origin, self.pose,
+                                own.pose, self.moves, self.rules.decision_price, is_open)
+        return int(move), float(worth)
+
+    def _doubt(self, own: Hypothesis) -> int | None:
+        """The robot stands where a hypothesis says, and the picture does not: look again, or not.
+
+        None: it is given up.
+        """
+        own.doubted += 1
+        own.likeliest = max(own.likeliest, self.arrival)
+        assert self.seen is not None  # of this decision
+        if own.doubted > self.rules.looks_in_doubt or self.seen.co_visible < MISS_BELOW:
+            own.doubted = 0
+            self.hypotheses.refute(own)
+            return None
+        self.aim = 'doubt'
+        turn = wrap_angle(float(own.pose[2] - self.pose[2]))
+        return self._left if turn > 0 else self._right
+
+    def _explore(self, costmap: Costmap, here: tuple[int, int], look: bool = True) -> int | None:
+        """Towards unknown floor, or, with `look`, a turn that shows some."""
         rules = self.rules
         turns = np.arange(-math.ceil(math.pi / self._turn), math.ceil(math.pi / self._turn) + 1)
         gains = self.grid.look_gains(self.pose, self.pose[2] + turns * self._turn, self.bearings)
         worth = np.minimum(rules.look_worth * gains, rules.look_most)
         price = rules.look_cost * np.abs(turns) - np.where(gains >= rules.look_from, worth, -99.0)
-        price[turns == 0] = np.inf
+        price[(turns == 0) | (not look)] = np.inf
         price += np.where(self._turns_back(turns), rules.back_cost, 0)
         best = int(np.argmin(price))
         cells, head_start = costmap.frontiers()
@@ -211,7 +277,8 @@ class Searcher:
             field = costmap.cost_to_go(cells, most - head_start, here, through_unknown=False)
             away = field[here] - most
             if np.isfinite(away) and (price[best] > 50 or away < price[best]):
-                if self._sees_nothing_new():
+                if self._sees_nothing_new() or self._contacts >= IN_VAIN:
+                    self._contacts = 0
                     self.grid.give_up(_foot_of(field, here), ROOM)
                 drive = self._drive(field, costmap)
         if drive is not None:
@@ -232,35 +299,35 @@ class Searcher:
         return True
 
     def _drive(self, field: np.ndarray, costmap: Costmap) -> int | None:
-        """The first action of turns and a move that lead on best; None: none does."""
-        rules = self.rules
-        most = math.ceil(math.pi / self._turn)
-        best, chosen = np.inf, None
-        for k in sorted(range(-most, most + 1), key=abs):
-            yaw = self.pose[2] + k * self._turn
-            for action in self._drives:
-                dx, dy, _ = self.moves[action]
-                length, angle = math.hypot(dx, dy), yaw + math.atan2(dy, dx)
-                if self._is_blocked(angle):
-                    continue
-                got, clear = costmap.free_length(self.pose, angle, length)
-                end = self.pose[:2] + got * np.array([math.cos(angle), math.sin(angle)])
-                cost = (self._at(field, end) + got + rules.turn_cost * abs(k)
-                        + rules.contact_cost * (length - got)
-                        + rules.graze_cost * max(1 - (clear - self.footprint) / rules.graze_m, 0)
-                        + (rules.backward_cost if dx <= 0 else 0.0)
-                        + (rules.back_cost if self._turns_back(np.array([k]))[0] else 0.0))
-                if got > 0.45 * length and cost < best:
-                    best = cost
-                    chosen = action if k == 0 else self._left if k > 0 else self._right
-        return None if chosen is None or not np.isfinite(best) else int(chosen)
-
-    def _at(self, field: np.ndarray, place: np.ndarray) -> float:
-        """A field's value at a place: of the best cell about it."""
-        row, column = self.grid.cell(*place)
-        part = field[max(row - 1, 0):row + 2, max(column - 1, 0):column + 2]
-        return float(field[row, column]) if np.isfinite(field[row, column]) else float(
-            part.min()) + 0.15
+        """The first action of turns and moves that lead on best; None: none does."""
+        rules, most = self.rules, math.ceil(math.pi / self._turn)
+        counts = np.arange(-most, most + 1)
+        headings = self.pose[2] + counts * self._turn
+        more = np.where(self._turns_back(counts), rules.back_cost, 0.0)
+        more[[self._is_blocked(angle) for angle in headings]] = np.inf
+        prices = np.array([rules.turn_cost, rules.contact_cost, rules.graze_cost, rules.graze_m,
+                           self.footprint])
+        turns, best = best_turns(
+            costmap.passable, costmap.clearance, field, self.grid.origin, self.pose, self._turn,
+            float(np.hypot(*self.moves[self._ahead, :2])), most, more, prices)
+        chosen = self._ahead if turns == 0 else self._left if turns > 0 else self._right
+        for action in self._drives:
+            if action == self._ahead:
+                continue
+            dx, dy, _ = self.moves[action]
+            length, angle = math.hypot(dx, dy), self.pose[2] + math.atan2(dy, dx)
+            if self._is_blocked(angle):
+                continue
+            got, clear = costmap.free_length(self.pose, angle, length)
+            if got <= 0.45 * length:
+                continue
+            end = self.pose[:2] + got * np.array([math.cos(angle), math.sin(angle)])
+            cost = (cost_at(field, self.grid.origin, end[0], end[1]) + got
+                    + rules.contact_cost * (length - got) + rules.backward_cost
+                    + rules.graze_cost * max(1 - (clear - self.footprint) / rules.graze_m, 0))
+            if cost < best:
+                best, chosen = cost, action
+        return int(chosen) if np.isfinite(best) else None
 
     def _is_blocked(self, angle: float) -> bool:
         """Whether a move in this direction [rad] met something about here before."""
