@@ -92,7 +92,7 @@ def test_a_robot_recalls_map_and_goal_within_a_few_decisions(taught, driven):
     (['--checkpoint', SEARCH, '--set', 'epochs=2'], 'without a training'),
     (['--set', 'architecture=search'], 'architecture search has no actor'),
 ])
-def test_what_needs_a_training_is_refused(words, says, tmp_path, capsys):
+def test_what_it_cannot_be_taught_with_is_refused(words, says, tmp_path, capsys):
     assert main(['teach', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), *words]) == 2
     said = capsys.readouterr().err
     assert says in said and said.count('\n') == 1

@@ -51,7 +51,8 @@ def place(count=5):
     lane[19:22, 5:26] = 1
     poses = np.column_stack([np.linspace(0.5, 2.5, count), np.full(count, 2.0), np.zeros(count)])
     return TaughtPlace(pictures(count), poses.astype(np.float32), log_odds,
-                       np.full((40, 60), 2.0, np.float32), lane, np.zeros(2, np.float32))
+                       np.full((40, 60), 2.0, np.float32), lane, np.zeros(2, np.float32),
+                       np.ones(1, np.float32))
 
 
 def taught(count=5):
@@ -231,7 +232,8 @@ def test_goals_of_the_drive_are_hypotheses_until_looks_know_better():
     for _ in range(3):
         recall.keys.said = [([mode(9.0, 9.0, 0.0)], 0.9)]
         recall.look(search, None)
-    assert recall.localiser.sure and best not in search.hypotheses.all
+    assert recall.localiser.sure and all(
+        own is not best for own in search.hypotheses.all)
 
 
 def test_the_map_of_a_drive_has_its_floor_in_it():
@@ -295,7 +297,7 @@ def test_a_damaged_place_is_refused(damage, says, tmp_path):
 @pytest.mark.parametrize('change', [
     {'poses': np.zeros((4, 3), np.float32)}, {'poses': np.full((5, 3), np.nan, np.float32)},
     {'seen': np.zeros((3, 3), np.float32)}, {'origin': np.zeros(2)},
-    {'pictures': np.zeros((5, 3, 48, 48), np.float32)},
+    {'pictures': np.zeros((5, 3, 48, 48), np.float32)}, {'zoom': np.zeros(1, np.float32)},
 ])
 def test_parts_that_do_not_fit_are_no_place(change):
     with pytest.raises(UserError, match='taught place'):
@@ -334,6 +336,30 @@ def test_robots_in_one_place_do_not_disturb_each_other():
     assert all(len(own) for own in together) and not np.allclose(together[0], together[1])
     for one, other in zip(together, alone, strict=True):
         assert one == pytest.approx(other, abs=1e-3)
+
+
+def test_through_another_lens_it_searches_as_if_it_had_been_taught_nothing():
+    policy = taught()
+    maps = policy.encode_goals(torch.from_numpy(pictures(1, 9)))
+    for zoom, told in ((1.0, True), (1.7, False)):
+        driver = SearchDriver(policy, 1)
+        driver.act(pictures(1, 20), maps, np.array([-1]), np.array([True]), np.zeros((1, 3)),
+                   zoom=zoom)
+        assert bool(driver.recalls[0].localiser.poses) == told
+
+
+def test_votes_through_a_narrow_lens_are_in_metres():
+    policy = taught()
+    shown = torch.from_numpy(pictures(1, 9))
+    goal = policy.encode_goals(shown)
+    look = policy.look(torch.from_numpy(place(1).pictures), goal)
+    one = KeyPictures(policy, place(1)).poses_of_goal(goal)[0].pose
+    narrow = dataclasses.replace(place(1), zoom=np.full(1, 2, np.float32))
+    other = KeyPictures(policy, narrow).poses_of_goal(goal)[0].pose
+    at = place(1).poses[0]
+    ahead, left = (float(part) for part in look.position[0])
+    assert one[:2] - at[:2] == pytest.approx([ahead, left], abs=1e-4)
+    assert other[:2] - at[:2] == pytest.approx([2 * ahead, left], abs=1e-4)
 
 
 def test_a_prior_is_dropped_when_the_map_moves():

@@ -12,6 +12,7 @@ import torch
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
 from vn_nav.policy.search.grid import CELL, MARGIN, MOST, OccupancyGrid
+from vn_nav.policy.search.lens import bearings_through, in_metres
 from vn_nav.policy.search.look import RANGE_EDGES, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.taught import MOST_SIDE, TaughtPlace
@@ -46,14 +47,15 @@ def choose_keys(pictures: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 @torch.inference_mode()
 def recall_drive(network: SearchPolicy, pictures: np.ndarray, poses: np.ndarray,
-                 keys: np.ndarray, show: Callable[[float], None] = lambda share: None
-                 ) -> TaughtPlace:
+                 keys: np.ndarray, zoom: float = 1.0,
+                 show: Callable[[float], None] = lambda share: None) -> TaughtPlace:
     """The place of a drive, its map drawn by what the policy sees on the way.
 
     Args:
         network: the policy.
         pictures: [N,3,S,S] uint8; poses: [N,3] x, y [m], yaw [rad].
         keys: rows of the key pictures.
+        zoom: of the pictures' lens, see `vn_nav.policy.search.lens`.
         show: called with the share that is done.
 
     Raises:
@@ -70,14 +72,16 @@ def recall_drive(network: SearchPolicy, pictures: np.ndarray, poses: np.ndarray,
                         f'{(high - low).max():.0f} m', 'teach a part of the drive (--pictures)')
     grid = OccupancyGrid(config.footprint, side, (low + high) / 2)
     bearings = column_bearings(config.view)
+    goal = network.encode_goals(torch.from_numpy(pictures[keys[:1]]))  # any: ranges have none
     # By key pictures alone: of views so near one another the ranges err together, and many of them
     # would outvote the walls that others see.
     for start in range(0, len(keys), BATCH):
         show(start / len(keys))
         rows = keys[start:start + BATCH]
-        ranges = network.ranges(torch.from_numpy(pictures[rows]), network.compute_dtype)
-        for pose, own in zip(poses[rows], ranges.exp().numpy(), strict=True):
-            grid.add_ranges(pose, bearings, own, RANGE_EDGES)
+        look = in_metres(network.look(torch.from_numpy(pictures[rows]), goal,
+                                      torch.zeros(len(rows), dtype=torch.int64)), bearings, zoom)
+        for pose, own in zip(poses[rows], look.ranges.exp().numpy(), strict=True):
+            grid.add_ranges(pose, bearings_through(bearings, zoom), own, RANGE_EDGES)
     for pose in poses:
         grid.add_footprint(pose)
     off = cv2.distanceTransform((~grid.been).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
@@ -91,4 +95,5 @@ def recall_drive(network: SearchPolicy, pictures: np.ndarray, poses: np.ndarray,
         np.ascontiguousarray(pictures[keys]), poses[keys].astype(np.float32),
         *(np.ascontiguousarray(layer[r0:r1, c0:c1], np.float32)
           for layer in (log_odds, seen, lane)),
-        (grid.origin + CELL * np.array([c0, r0])).astype(np.float32))
+        (grid.origin + CELL * np.array([c0, r0])).astype(np.float32),
+        np.array([zoom], np.float32))

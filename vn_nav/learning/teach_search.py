@@ -15,6 +15,7 @@ from vn_nav.learning.teaching import Teaching
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.search.grid import CELL, KNOWN
+from vn_nav.policy.search.lens import zoom_of
 from vn_nav.policy.search.network import SearchPolicy
 
 
@@ -39,8 +40,9 @@ class SearchTeaching(Teaching):
         pictures, poses = graph.pictures[rows], graph.poses[rows]
         self.stages('choosing key pictures', 0.0)
         keys = choose_keys(pictures, poses)
-        place = recall_drive(network, pictures, poses, keys,
-                             functools.partial(self.stages, 'drawing the map'))
+        place = recall_drive(network, pictures, poses, keys, zoom_of(
+            self.robot.camera_fov, network.config.view),
+            functools.partial(self.stages, 'drawing the map'))
         network.taught = place
         facts = {'key_pictures': len(keys),
                  'mapped_m2': round(CELL**2 * float((place.seen >= KNOWN).sum()), 1)}
@@ -54,4 +56,5 @@ class SearchTeaching(Teaching):
         assert self.given is not None
         before = self.given.info
         return {**super()._info(), **{name: before[name] for name in (
-            'preset', 'decoding', 'stop_threshold', 'losses', 'randomisation')}}
+            # What the camera sees is told by how it magnifies against the lens that they know.
+            'camera_fov_deg', 'preset', 'decoding', 'stop_threshold', 'losses', 'randomisation')}}

@@ -44,7 +44,6 @@ from vn_nav.learning.training import CHECKPOINT, STATE
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
-from vn_nav.policy.search.lens import SAME, zoom_of
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_nav.scenes import parse_scene
 
@@ -130,7 +129,8 @@ def _robot(job: TeachJob, given: LoadedCheckpoint | None) -> RobotSpec:
     if given is None:
         return robot.with_actions(DRIVE_ACTIONS)
     if given.config.architecture == SEARCH:
-        robot = _through_its_lens(robot, given.config.view)
+        # A wider camera's pictures are cropped to the lens that the policy knows.
+        robot = dataclasses.replace(robot, camera_fov=min(robot.camera_fov, given.config.view))
     before = given.info['camera_fov_deg'], given.info['camera_height']
     now = math.degrees(robot.camera_fov), robot.camera_height
     if any(abs(a - b) > 0.01 * b for a, b in zip(now, before, strict=True)):
@@ -139,19 +139,6 @@ def _robot(job: TeachJob, given: LoadedCheckpoint | None) -> RobotSpec:
               + ('what it sees is less exact' if given.config.architecture == SEARCH else
                  'the policy adapts to it'), flush=True)
     return robot.with_actions(given.config.actions, given.config.moves)
-
-
-def _through_its_lens(robot: RobotSpec, view: float) -> RobotSpec:
-    """The robot with the part of its pictures that a policy which searches knows its lens by.
-
-    Raises:
-        UserError: the camera is narrower.
-    """
-    if zoom_of(robot.camera_fov, view) > 1 + SAME:
-        raise UserError('a policy that searches is taught with a lens as wide as its own, '
-                        f'{math.degrees(view):.0f} deg', f'{math.degrees(robot.camera_fov):.0f} '
-                        'deg', 'let it search untaught there, or record with another camera')
-    return dataclasses.replace(robot, camera_fov=view)
 
 
 class Teaching:

@@ -101,7 +101,9 @@ class SearchDriver:
             if starts[n]:
                 searcher.reset()
             recall = None
-            if self.recalls is not None and self._keys is not None and abs(zoom - 1) < SAME:
+            # Through another lens the key pictures look different.
+            if self.recalls is not None and self._keys is not None and (
+                    abs(zoom / self.recalls[n].place.zoom[0] - 1) < SAME):
                 own = self.recalls[n]
                 if starts[n]:
                     own.begin(self._poses_of_goal(self._keys, goal_maps[n:n + 1]))

@@ -14,7 +14,8 @@ from torch.nn import functional as F
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.pose_graph import between, compose
 from vn_nav.policy.encoders import apply, directions
-from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
+from vn_nav.policy.search.lens import pose_in_metres
+from vn_nav.policy.search.network import PER_AXIS, Recognition, SearchPolicy, heading_deviation
 from vn_nav.policy.search.taught import TaughtPlace
 
 ALIKE, TRACKED = 8, 4  # key pictures that a picture is compared with: most alike; about the robot
@@ -52,6 +53,15 @@ class Votes(NamedTuple):
     precisions: np.ndarray  # [K] 1/m^2 of the position
 
 
+class _Seen(NamedTuple):
+    """Of K pairs."""
+
+    there: np.ndarray  # [K,3] pose of the second picture as seen from the first
+    sigma: np.ndarray  # [K] m of its position
+    heading_sigma: np.ndarray  # [K] rad
+    co_visible: np.ndarray  # [K] logit
+
+
 class KeyPictures:
     """The key pictures of a place, seen by a network.
 
@@ -66,6 +76,7 @@ class KeyPictures:
     @torch.inference_mode()
     def __init__(self, network: SearchPolicy, place: TaughtPlace):
         self.network, self.poses = network, place.poses.astype(float)
+        self._zoom = float(place.zoom[0])
         pictures = torch.from_numpy(place.pictures)
         self._seen = torch.cat([network.encoder.see(part, network.compute_dtype)
                                 for part in pictures.split(64)])
@@ -82,12 +93,8 @@ class KeyPictures:
         said = [self.network.recogniser(self.network.encoder.meet(
             part, goal_maps.expand(len(part), *goal_maps.shape[1:]), None)[1])
             for part in self._seen.split(64)]
-        position, heading, log_scale, kappa, co_visible = (
-            torch.cat([getattr(one, name) for one in said]).numpy() for name in (
-                'position', 'heading', 'log_scale', 'log_concentration', 'co_visible'))
-        there = np.column_stack([position, np.arctan2(heading[:, 1], heading[:, 0])])
-        return modes_of(_votes(compose(self.poses, there), position, log_scale, kappa, co_visible,
-                               turned=False))
+        seen = self._in_metres(Recognition(*map(torch.cat, zip(*said, strict=True))))
+        return modes_of(_votes(compose(self.poses, seen.there), seen, turned=False))
 
     @torch.inference_mode()
     def recognise(self, image: Tensor, about: np.ndarray | None) -> tuple[list[Mode], float]:
@@ -116,14 +123,19 @@ class KeyPictures:
             close = close[off[close] < 1]
         said = network.recogniser(network.encoder.meet(
             seen.expand(len(rows), -1, -1, -1), self._maps[torch.from_numpy(rows)], None)[1])
-        position, heading = said.position.numpy(), said.heading.numpy()
-        there = np.column_stack([position, np.arctan2(heading[:, 1], heading[:, 0])])
-        poses = compose(self.poses[rows], between(there, np.zeros(3)))
-        votes = _votes(poses, position, *(part.numpy() for part in (
-            said.log_scale, said.log_concentration, said.co_visible)), turned=True)
+        found = self._in_metres(said)
+        poses = compose(self.poses[rows], between(found.there, np.zeros(3)))
+        votes = _votes(poses, found, turned=True)
         tracked = votes.odds[np.isin(rows, close)]
         return modes_of(votes), float(
             (tracked / (1 + tracked)).max()) if len(tracked) else math.nan
+
+    def _in_metres(self, said: Recognition) -> _Seen:
+        position, sigma, heading, heading_sigma = (part.numpy() for part in pose_in_metres(
+            said.position, PER_AXIS * said.log_scale.exp(), said.heading,
+            heading_deviation(said.log_concentration), self._zoom))
+        return _Seen(np.column_stack([position, np.arctan2(heading[:, 1], heading[:, 0])]), sigma,
+                     heading_sigma, said.co_visible.numpy())
 
 
 def _pooled(maps: Tensor) -> Tensor:
@@ -131,14 +143,13 @@ def _pooled(maps: Tensor) -> Tensor:
     return directions(F.adaptive_avg_pool2d(maps, POOLED)).permute(0, 2, 3, 1).flatten(1, 2)
 
 
-def _votes(poses, position, log_scale, log_concentration, co_visible, turned: bool) -> Votes:
-    """Votes for poses, of what the recogniser says; `turned`: its heading turns the position."""
-    odds = np.minimum(np.exp(np.minimum(co_visible, 20.0)), ODDS_MOST)
-    far = np.hypot(*position.T)
-    variance = (PER_AXIS * np.exp(log_scale))**2 + LEAST_SIGMA**2
+def _votes(poses: np.ndarray, seen: _Seen, turned: bool) -> Votes:
+    """Votes for poses, of what was seen; `turned`: its heading has turned the position."""
+    odds = np.minimum(np.exp(np.minimum(seen.co_visible, 20.0)), ODDS_MOST)
+    far = np.hypot(*seen.there[:, :2].T)
+    variance = seen.sigma**2 + LEAST_SIGMA**2
     if turned:
-        sigma = heading_deviation(torch.from_numpy(log_concentration)).numpy()
-        variance = variance + (far * np.minimum(sigma, 1.5))**2
+        variance = variance + (far * np.minimum(seen.heading_sigma, 1.5))**2
     return Votes(poses, odds, odds / np.maximum(far, NEAR), 1 / variance)
 
 

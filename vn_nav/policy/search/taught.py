@@ -28,6 +28,7 @@ class TaughtPlace:
     seen: np.ndarray  # [R,C] float32
     lane: np.ndarray  # [R,C] float32: 1 where the robot's centre was
     origin: np.ndarray  # [2] float32 m, of the map's lower left corner
+    zoom: np.ndarray  # [1] float32: of the pictures' lens, see `vn_nav.policy.search.lens`
 
     def __post_init__(self):
         count, side = len(self.poses), self.log_odds.shape
@@ -37,13 +38,16 @@ class TaughtPlace:
                 and self.poses.shape == (count, 3) and len(side) == 2
                 and self.seen.shape == self.lane.shape == side
                 and 1 <= min(side) and max(side) <= MOST_SIDE
-                and self.origin.shape == (2,))
+                and self.origin.shape == (2,) and self.zoom.shape == (1,))
         if not fits:
             raise UserError('a taught place has key pictures, a pose for each, and a map',
                             ', '.join(f'{field.name} {getattr(self, field.name).shape}'
                                       for field in dataclasses.fields(self)), 'teach it again')
-        for name in ('poses', 'log_odds', 'seen', 'lane', 'origin'):
+        for name in ('poses', 'log_odds', 'seen', 'lane', 'origin', 'zoom'):
             part = getattr(self, name)
             if part.dtype != np.float32 or not np.isfinite(part).all():
                 raise UserError('numbers of a taught place are finite, of 32 bits',
                                 f'{name} {part.dtype}', 'teach it again')
+        if not 0.1 < self.zoom[0] < 10:
+            raise UserError('the lens of a taught place magnifies 0.1 to 10 times', self.zoom[0],
+                            'teach it again')
