@@ -333,7 +333,7 @@ def test_robots_in_one_place_do_not_disturb_each_other():
         return [np.array([[*own.pose, own.share] for own in recall.localiser.poses])
                 for recall in driver.recalls]
     together, alone = drive([0, 1, 2]), [drive([k])[0] for k in range(3)]
-    assert all(len(own) for own in together) and not np.allclose(together[0], together[1])
+    assert all(len(own) for own in together) and not np.array_equal(together[0], together[1])
     for one, other in zip(together, alone, strict=True):
         assert one == pytest.approx(other, abs=1e-3)
 
