@@ -335,7 +335,7 @@ class Searcher:
                     + rules.contact_cost * (length - got) + rules.backward_cost
                     + rules.graze_cost * max(1 - (clear - self.footprint) / rules.graze_m, 0))
             if cost < best:
-                best, chosen = cost, action
+                best, chosen = cost, int(action)
         return int(chosen) if np.isfinite(best) else None
 
     def _cut_off(self, costmap: Costmap, angles: np.ndarray, lengths: np.ndarray) -> np.ndarray:
