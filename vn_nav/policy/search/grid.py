@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from vn_nav.measured_ranges import Scan
-from vn_nav.policy.search.measured import enter_scan, look_over
+from vn_nav.policy.search.measured import ends_of, enter_scan, look_over
 
 CELL = 0.1  # m
 SIDE = 320  # cells
@@ -44,6 +44,7 @@ class OccupancyGrid:
         stood: [SIDE,SIDE] bool: the robot was on it; been: its centre was.
         contacts: [SIDE,SIDE] bool: it met something here.
         origin: [2] m, of the lower left corner.
+        points: [K,2] m where the rays of the newest scan end; None: a picture came since.
     """
 
     def __init__(self, footprint: float):
@@ -56,6 +57,7 @@ class OccupancyGrid:
         self.been = np.zeros((SIDE, SIDE), bool)
         self.contacts = np.zeros((SIDE, SIDE), bool)
         self.origin = np.array([-CELL * SIDE / 2, -CELL * SIDE / 2])
+        self.points: np.ndarray | None = None
 
     def add_ranges(self, pose: np.ndarray, bearings: np.ndarray, ranges: np.ndarray,
                    edges: np.ndarray) -> None:
@@ -69,6 +71,7 @@ class OccupancyGrid:
                 one farther than the last.
         """
         self._follow(pose)
+        self.points = None
         spread = np.abs(np.gradient(bearings)).mean()
         _integrate(self.log_odds, self.seen, self.origin, np.asarray(pose, float),
                    np.asarray(bearings, float), float(spread), np.asarray(ranges, float),
@@ -93,6 +96,7 @@ class OccupancyGrid:
         enter_scan(self.log_odds, self.measured, self.origin, CELL, at, scanner.bearings,
                    scan.ranges.astype(float), scanner.nearest, scanner.clear_from,
                    min(scanner.farthest, SCAN_REACH), FREE_WEIGHT, HIT_WEIGHT, MOST)
+        self.points = ends_of(scan, at, SCAN_REACH)
         angles = pose[2] + np.asarray(bearings, float)
         look_over(self.seen, self.measured, self.obstacles(), self.origin, CELL, pose[0], pose[1],
                   angles, REACH, SUB_RAYS)
