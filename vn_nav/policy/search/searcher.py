@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -108,7 +108,8 @@ class Searcher:
         self._decisions, self._forgot, self._stuck_for = 0, -FORGET_EVERY, 0
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
-             unmoved: bool = False, scan: Scan | None = None) -> int:
+             unmoved: bool = False, scan: Scan | None = None,
+             recall: Callable[[Searcher], None] | None = None) -> int:
         """The next action.
 
         Args:
@@ -118,6 +119,7 @@ class Searcher:
             unmoved: without odometry: the picture is as before the action.
             scan: measured where the picture was taken: the map takes it in place of the ranges
                 that are seen.
+            recall: brings to mind what is known of the place; called before the decision.
         """
         self._move(last_action, odometry, unmoved)
         self.grid.add_footprint(self.pose)
@@ -128,6 +130,8 @@ class Searcher:
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
         self.arrival, self.seen = sight.arrived, sight
+        if recall is not None:
+            recall(self)
         action = self._decide()
         self._last = action
         return action
