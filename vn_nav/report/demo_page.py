@@ -169,7 +169,7 @@ def _maps(recorded: RecordedEpisode, plan: dict) -> str:
     bounds = plan['bounds'] if 'bounds' in plan else known_bounds(last.search, last.frame)
     x0, y0, x1, y1 = bounds
     view = Window.about(bounds, MAP_WIDTH, round(MAP_WIDTH * (y1 - y0 + 1) / (x1 - x0 + 1)))
-    figures = []
+    figures: list[str] = []
     for count in (numbers[k] for k in picked):
         known = recorded.searches[count]
         drawn = draw(known.search, view, known.frame, plan=plan if 'bounds' in plan else None,

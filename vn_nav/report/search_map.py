@@ -104,7 +104,8 @@ def draw(seen: Snapshot, view: Window, frame: np.ndarray, *, plan: Mapping[str, 
     if goal is not None:
         _arrow(image, view, np.array(goal[:3], float), 0.55, GOAL_RGB, filled=False)
     for k, guess in reversed(list(enumerate(seen.guesses[:MOST_GUESSES]))):
-        share = 1.0 if math.isnan(guess.weight) else min(guess.weight / STRONG, 1.0)
+        unknown = math.isnan(guess.weight)  # their order is known all the same
+        share = (0.0 if k else 1.0) if unknown else min(guess.weight / STRONG, 1.0)
         pose = np.array([*placed(frame, guess.pose[None, :2])[0], frame[2] + guess.pose[2]])
         _arrow(image, view, pose, 0.75 * (SMALLEST + (1 - SMALLEST) * math.sqrt(share)),
                BEST_RGB if k == 0 else GUESS_RGB, filled=True)
