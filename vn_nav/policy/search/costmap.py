@@ -84,7 +84,7 @@ class Costmap:
             pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
         """
         return free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
-                            float(pose[1]), angle, length)
+                           float(pose[1]), angle, length)
 
 
 @numba.njit(cache=True)
