@@ -61,9 +61,10 @@ BANDS = {'tenth': (POSE_OVERLAP, 0.25), 'quarter': (0.25, 0.5), 'half': (0.5, 1.
 STRETCHES = 10
 BATCH = 1000  # pairs
 NEAR = 0.3  # m: nearer, a bearing means nothing
+SURE = 30  # matches
 FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'bearing_deg',
-           'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'recognised',
-           'recognisable')
+           'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'sure', 'sure_far',
+           'recognised', 'recognisable')
 
 
 class Pairs(NamedTuple):
@@ -169,6 +170,14 @@ def arrival(pairs: Pairs, score: np.ndarray) -> dict[str, float]:
     return {'arrived_auc': auc(score, there), 'arrived_ring_auc': auc(score[near], there[near])}
 
 
+def sure(pairs: Pairs, count: np.ndarray) -> dict[str, float]:
+    """How often a count [P] of matches is `SURE`: of arrivals, and of pairs beyond the ring."""
+    distance = np.hypot(*pairs.truth[:, :2].T)
+    turn = np.abs(np.arctan2(pairs.truth[:, 3], pairs.truth[:, 2]))
+    return {'sure': float((count >= SURE)[is_arrived(distance, turn)].mean()),
+            'sure_far': float((count >= SURE)[distance > RING_RADIUS].mean())}
+
+
 def recognition(pairs: Pairs, score: np.ndarray) -> dict[str, float]:
     """Share of the photographs whose best match in other stretches overlaps, and could."""
     count = len(pairs.chosen)
@@ -251,7 +260,8 @@ def run(options: argparse.Namespace) -> None:
                            said.arrived.numpy())
     for name in options.features:
         for kind, counts in matched(name, sequence, pairs.chosen).items():
-            rows[f'{name}, {kind}'] = judge(pairs, counts[pairs.first, pairs.second])
+            score = counts[pairs.first, pairs.second]
+            rows[f'{name}, {kind}'] = judge(pairs, score) | sure(pairs, score)
     print_table(rows)
     result = {'checkpoint': str(options.checkpoint), 'pairs': len(pairs.first), 'sight': rows}
     if options.drive:
