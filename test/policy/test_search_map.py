@@ -5,10 +5,12 @@ import math
 import numpy as np
 import pytest
 
+import vn_nav.policy.search.searcher as searcher_module
 from vn_nav.measured_ranges import Scan, Scanner, laser_scan
+from vn_nav.policy.search.approach import arrives, best_move
 from vn_nav.policy.search.costmap import Costmap
 from vn_nav.policy.search.grid import CELL, SIDE, OccupancyGrid, on_robot
-from vn_nav.policy.search.hypotheses import Hypotheses, apart, on_map
+from vn_nav.policy.search.hypotheses import Hypotheses, Hypothesis, apart, on_map
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, column_bearings
 from vn_nav.policy.search.measured import free_of_points
 from vn_nav.policy.search.searcher import Searcher, Sight
@@ -165,10 +167,67 @@ def test_each_attempt_in_vain_asks_for_more_evidence():
     best = own.best()
     assert own.worth_trying(2.0) == [best]
     own.refute(best)
-    best.weight = 1.45 * 2.0
+    best.weight = 2.9 * 2.0
     assert own.worth_trying(2.0) == []
-    best.weight = 1.55 * 2.0
+    best.weight = 3.1 * 2.0
     assert own.worth_trying(2.0) == [best]
+
+
+def test_where_the_robot_stood_and_saw_nothing_of_the_goal_counts_for_hardly_anything():
+    own = Hypotheses()
+    for likeliest, left in ((0.5, 0.25), (0.05, 0.02)):
+        hypothesis = Hypothesis(np.zeros(3), 100.0, 1.0, likeliest=likeliest)
+        own.refute(hypothesis)
+        assert hypothesis.weight == 100.0 * left and hypothesis.likeliest == 0
+    own.all = [hypothesis]
+    own.look(np.zeros(3), np.zeros(2), 0.3, np.array([1.0, 0.0]), 0.9)
+    fresh = Hypotheses()
+    fresh.look(np.zeros(3), np.zeros(2), 0.3, np.array([1.0, 0.0]), 0.9)
+    assert hypothesis.weight == pytest.approx(2.0 + fresh.best().weight / 2)
+
+
+@pytest.mark.parametrize('goal, wanted, decisions', [
+    ((0.5, 0.0, 0.0), FORWARD, 1), ((-0.5, 0.0, 0.0), BACKWARD, 1),
+    ((0.0, 0.0, math.pi / 3), LEFT, 2), ((0.1, 0.0, 0.1), -1, 0)])
+def test_the_last_metre_takes_place_and_heading_together(goal, wanted, decisions):
+    costmap = Costmap(looked_around())
+    move, worth = best_move(costmap.passable, costmap.clearance, costmap.grid.origin, np.zeros(3),
+                            np.array(goal), np.array(MOVES), 0.03, np.ones(4, bool))
+    assert move == wanted
+    at_end = 1.0 if decisions == 0 else worth + 0.03 * decisions
+    assert arrives(0.1, 0.0) - 0.02 < at_end <= 1.0
+
+
+def test_a_hypothesis_behind_a_wall_is_not_approached_through_it():
+    grid = looked_around()
+    for y in np.arange(-2.0, 2.01, CELL):
+        grid.add_contact(np.array([0.2, y, 0.0]), 0.0)
+    costmap = Costmap(grid)
+    _, worth = best_move(costmap.passable, costmap.clearance, grid.origin, np.zeros(3),
+                         np.array([1.3, 0.0, 0.0]), np.array(MOVES), 0.03, np.ones(4, bool))
+    assert worth < 0.01
+
+
+def test_a_robot_that_gets_nowhere_stops_looking_about_and_passes_obstacles_closer(monkeypatch):
+    drives = []
+    monkeypatch.setattr(searcher_module, 'Costmap',
+                        lambda *args, **more: (drives.append(more), Costmap(*args, **more))[1])
+    own, last, odometry = searcher(), -1, np.zeros(3)
+    for _ in range(2 * searcher_module.STUCK):  # it stands in a niche: nothing moves but its head
+        last = own.step(sight(ranges=one_hot(room(odometry, 0.35))), last, odometry)
+        if last in (LEFT, RIGHT):
+            odometry = odometry + [0, 0, MOVES[last][2]]
+        if own._decisions == searcher_module.STUCK - 1:
+            assert not own._stuck_for
+            drives.clear()
+    assert {'off': searcher_module.TIGHT} in drives and own._stuck_for
+    assert own.aim != 'look'
+    narrow = OccupancyGrid(0.25)
+    for side in (math.pi / 2, -math.pi / 2):  # 0.6 m between what it has touched
+        narrow.add_contact(np.array([1.0, 0.0, 0.0]), side)
+    cell = narrow.cell(1.0, 0.0)
+    assert not Costmap(narrow).passable[cell]
+    assert Costmap(narrow, off=searcher_module.TIGHT).passable[cell]
 
 
 def test_a_way_that_becomes_no_shorter_is_given_up():
@@ -217,7 +276,13 @@ def test_it_drives_to_what_it_recognises_turns_and_then_gives_the_place_up():
         pose = pose + [c * move[0], s * move[0], move[2]]
         if apart(pose, goal)[0] < 0.4 and apart(pose, goal)[1] < 0.3:
             break
-    assert own.aim == 'turn' and apart(pose, goal)[0] < 0.4 and apart(pose, goal)[1] < 0.3
+    assert own.aim == 'approach' and apart(pose, goal)[0] < 0.4 and apart(pose, goal)[1] < 0.3
+    # It is there, and the pictures do not say so: it looks again, and then goes elsewhere.
+    aims = []
+    for _ in range(12):
+        aims.append((own.step(sight(ranges=one_hot(room(pose)), position=np.zeros(2),
+                                    co_visible=0.97, arrived=0.3), -1, pose), own.aim)[1])
+    assert 'doubt' in aims and own.hypotheses.best().refuted >= 1
 
 
 def test_without_odometry_it_counts_on_its_moves_and_sees_that_it_stood_still():
@@ -259,6 +324,16 @@ def test_a_move_that_met_something_is_not_tried_again_there():
             odometry = odometry + [0, 0, MOVES[last][2]]
     directions = [round(own[2] / (math.pi / 6)) % 12 for own in own._blocked]
     assert len(directions) == len(set(directions)) <= 12
+
+
+def test_a_turn_that_was_not_done_is_not_tried_again_there():
+    own, pose, asked = searcher(), np.zeros(3), [-1]
+    for _ in range(10):  # whatever it looks for, it cannot turn right
+        asked.append(own.step(sight(ranges=one_hot(room(pose))), asked[-1], pose))
+        dx, _, dyaw = MOVES[asked[-1]]
+        pose = pose + (dx * math.cos(pose[2]), dx * math.sin(pose[2]), max(dyaw, 0.0))
+    assert asked[1] == RIGHT and asked.count(LEFT) > 4
+    assert not any(asked[k] == asked[k + 1] == RIGHT for k in range(10))
 
 
 def test_the_same_looks_make_the_same_decisions():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -102,12 +102,14 @@ class Searcher:
         self._odometry: np.ndarray | None = None
         self._known: list[float] = []  # m^2, at the decisions of exploring
         self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
+        self._unturned: list[tuple[np.ndarray, int]] = []  # [3] poses, and where it could not turn
         self._track: list[tuple[float, float, float]] = []  # x, y [m], m^2 known: the last ones
         self._contacts = 0.0  # of late, while it explored
         self._decisions, self._forgot, self._stuck_for = 0, -FORGET_EVERY, 0
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
-             unmoved: bool = False, scan: Scan | None = None) -> int:
+             unmoved: bool = False, scan: Scan | None = None,
+             recall: Callable[[Searcher], None] | None = None) -> int:
         """The next action.
 
         Args:
@@ -117,6 +119,7 @@ class Searcher:
             unmoved: without odometry: the picture is as before the action.
             scan: measured where the picture was taken: the map takes it in place of the ranges
                 that are seen.
+            recall: brings to mind what is known of the place; called before the decision.
         """
         self._move(last_action, odometry, unmoved)
         self.grid.add_footprint(self.pose)
@@ -127,6 +130,8 @@ class Searcher:
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
         self.arrival, self.seen = sight.arrived, sight
+        if recall is not None:
+            recall(self)
         action = self._decide()
         self._last = action
         return action
@@ -152,6 +157,8 @@ class Searcher:
         self.pose = np.array([before[0] + c * done[0] - s * done[1],
                               before[1] + s * done[0] + c * done[1],
                               wrap_angle(before[2] + done[2])])
+        if abs(done[2]) < 0.5 * abs(move[2]):
+            self._unturned.append((self.pose.copy(), 1 if move[2] > 0 else -1))
         wanted = float(np.hypot(*move[:2]))
         if wanted > 0:
             if np.hypot(*done[:2]) < 0.75 * wanted:
@@ -237,6 +244,7 @@ class Searcher:
         is_open = np.array([bool(s) or not self._is_blocked(angle)
                             for s, angle in zip(still, ways, strict=True)])
         is_open &= self._cut_off(costmap, ways, np.hypot(*self.moves[:, :2].T)) <= 0
+        is_open &= ~self._cannot_turn(self.moves[:, 2])
         move, worth = best_move(costmap.passable, costmap.clearance, self.grid.origin, self.pose,
                                 own.pose, self.moves, self.rules.decision_price, is_open)
         return int(move), float(worth)
@@ -264,7 +272,7 @@ class Searcher:
         gains = self.grid.look_gains(self.pose, self.pose[2] + turns * self._turn, self.bearings)
         worth = np.minimum(rules.look_worth * gains, rules.look_most)
         price = rules.look_cost * np.abs(turns) - np.where(gains >= rules.look_from, worth, -99.0)
-        price[(turns == 0) | (not look)] = np.inf
+        price[(turns == 0) | (not look) | self._cannot_turn(turns)] = np.inf
         price += np.where(self._turns_back(turns), rules.back_cost, 0)
         best = int(np.argmin(price))
         cells, head_start = costmap.frontiers()
@@ -302,6 +310,7 @@ class Searcher:
         headings = self.pose[2] + counts * self._turn
         more = np.where(self._turns_back(counts), rules.back_cost, 0.0)
         more[[self._is_blocked(angle) for angle in headings]] = np.inf
+        more[self._cannot_turn(counts)] = np.inf
         step = float(np.hypot(*self.moves[self._ahead, :2]))
         off = self._cut_off(costmap, headings, np.full(len(headings), step))
         more += np.where(off < (1 - ENOUGH) * step, rules.contact_cost * off, np.inf)
@@ -340,6 +349,12 @@ class Searcher:
         return any(gap < BLOCKED_M and turn < BLOCKED_RAD
                    for gap, turn in (apart(here, own) for own in self._blocked))
 
+    def _cannot_turn(self, turns: np.ndarray) -> np.ndarray:
+        """Which numbers of turns begin with one that odometry says was not done about here."""
+        ways = {way for pose, way in self._unturned
+                if (off := apart(self.pose, pose))[0] < BLOCKED_M and off[1] < BLOCKED_RAD}
+        return np.isin(np.sign(turns), list(ways))
+
     def _turns_back(self, turns: np.ndarray) -> np.ndarray:
         """Which numbers of turns begin by undoing the last action."""
         if self._last == self._left:
@@ -356,6 +371,9 @@ class Searcher:
                 costmap.free_length(self.pose, angle, length)[0] >= 0.9 * length)
             if free and (dx > 0 or self._last not in (self._left, self._right)):
                 return int(action)
+        right, left = self._cannot_turn(np.array([-1, 1]))
+        if left != right:
+            return self._left if right else self._right
         return self._right if self._last == self._right else self._left
 
 
