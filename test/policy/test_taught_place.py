@@ -352,7 +352,8 @@ def test_votes_through_a_narrow_lens_are_in_metres():
     policy = taught()
     shown = torch.from_numpy(pictures(1, 9))
     goal = policy.encode_goals(shown)
-    look = policy.look(torch.from_numpy(place(1).pictures), goal)
+    with torch.no_grad():
+        look = policy.look(torch.from_numpy(place(1).pictures), goal)
     one = KeyPictures(policy, place(1)).poses_of_goal(goal)[0].pose
     narrow = dataclasses.replace(place(1), zoom=np.full(1, 2, np.float32))
     other = KeyPictures(policy, narrow).poses_of_goal(goal)[0].pose
