@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
                 said = look(network, images, pairs, zoom)
                 found.setdefault(f'{name}: {title}', []).append(judge(
                     pairs, said.co_visible.numpy(), said.position.numpy(), said.heading.numpy(),
-                    said.co_visible.numpy() > 0))
+                    said.co_visible.numpy() > 0, said.arrived.numpy()))
         sampler.simulator.close()
     print_table({title: {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
                  for title, rows in found.items()})

@@ -3,7 +3,7 @@
     python bench/photographs.py FOLDER --checkpoint models/search
     python bench/photographs.py FOLDER --cameras known width level grey --no-drive
     python bench/photographs.py FOLDER --episodes 60 --json photographs.json
-    python bench/photographs.py FOLDER --features --no-drive      # SIFT beside it
+    python bench/photographs.py FOLDER --features sift xfeat --no-drive --every 6
 
 The folder is described in `photo_sequence.py`. Reports, for each way to take a photograph for the
 policy's camera (`CAMERAS`):
@@ -12,6 +12,7 @@ policy's camera (`CAMERAS`):
   which the first shows `POSE_OVERLAP` of the second or more, by depth, negative one that shares
   nothing either way; in all and by bands of the overlap;
 - relative pose of pairs with an overlap of a quarter or more: median errors;
+- arrival: AUC against all other pairs, and against those that are nearly there;
 - place recognition: the sequence in ten stretches; for each photograph of one, does the likeliest
   of all other stretches truly overlap;
 - driving in the graph of the photographs (`vn_sim_bridge.recorded`): the right picture, the wrong
@@ -30,14 +31,22 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from photo_features import FEATURES, inliers
+from photo_features import FEATURES, matched
 from photo_sequence import Camera, Sequence
 
+from vn_nav.arrival import ARRIVAL_RADIUS
+from vn_nav.arrival import arrived as is_arrived
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.metrics import summarise
 from vn_nav.learning.auxiliary import POSE_OVERLAP
-from vn_nav.learning.sight_figures import angle_between, auc
+from vn_nav.learning.sight_figures import (
+    RING_RADIUS,
+    RING_SIDE,
+    RING_TURN,
+    angle_between,
+    auc,
+)
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.search.lens import in_metres, zoom_of
 from vn_nav.policy.search.look import BINS, COLUMNS, Look, column_bearings
@@ -52,8 +61,10 @@ BANDS = {'tenth': (POSE_OVERLAP, 0.25), 'quarter': (0.25, 0.5), 'half': (0.5, 1.
 STRETCHES = 10
 BATCH = 1000  # pairs
 NEAR = 0.3  # m: nearer, a bearing means nothing
+SURE = 30  # matches
 FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'bearing_deg',
-           'heading_deg', 'position_m', 'recognised', 'recognisable')
+           'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'sure', 'sure_far',
+           'recognised', 'recognisable')
 
 
 class Pairs(NamedTuple):
@@ -116,13 +127,15 @@ def look(network: SearchPolicy, images: np.ndarray, pairs: Pairs, zoom: float) -
 
 
 def judge(pairs: Pairs, score: np.ndarray, position: np.ndarray | None = None,
-          heading: np.ndarray | None = None, called: np.ndarray | None = None) -> dict[str, float]:
+          heading: np.ndarray | None = None, called: np.ndarray | None = None,
+          arrived: np.ndarray | None = None) -> dict[str, float]:
     """`FIGURES` of pairs with a score [P] that is high where the pictures overlap.
 
     Args:
         pairs: the pairs; score: [P].
         position, heading: [P,2] of the second in the frame of the first.
         called: [P] bool: whether they are said to overlap.
+        arrived: [P] score of having arrived; None: that of the overlap.
     """
     def against(low: float, high: float) -> float:
         own = (pairs.overlap >= low) & (pairs.overlap < high)
@@ -142,7 +155,27 @@ def judge(pairs: Pairs, score: np.ndarray, position: np.ndarray | None = None,
             'bearing_deg': _degrees(angle_between(position[far], pairs.truth[far, :2])),
             'heading_deg': _degrees(angle_between(heading[sees], pairs.truth[sees, 2:])),
             'position_m': float(np.median(gap))}
-    return found | recognition(pairs, score)
+    return found | arrival(pairs, score if arrived is None else arrived) | recognition(
+        pairs, score)
+
+
+def arrival(pairs: Pairs, score: np.ndarray) -> dict[str, float]:
+    """How well a score [P] tells arrivals from all else, and from what is nearly one."""
+    distance = np.hypot(*pairs.truth[:, :2].T)
+    turn = np.abs(np.arctan2(pairs.truth[:, 3], pairs.truth[:, 2]))
+    there = is_arrived(distance, turn)
+    ring = ~there & (((distance <= RING_RADIUS) & (turn <= RING_SIDE))
+                     | ((distance <= ARRIVAL_RADIUS) & (turn <= RING_TURN)))
+    near = there | ring
+    return {'arrived_auc': auc(score, there), 'arrived_ring_auc': auc(score[near], there[near])}
+
+
+def sure(pairs: Pairs, count: np.ndarray) -> dict[str, float]:
+    """How often a count [P] of matches is `SURE`: of arrivals, and of pairs beyond the ring."""
+    distance = np.hypot(*pairs.truth[:, :2].T)
+    turn = np.abs(np.arctan2(pairs.truth[:, 3], pairs.truth[:, 2]))
+    return {'sure': float((count >= SURE)[is_arrived(distance, turn)].mean()),
+            'sure_far': float((count >= SURE)[distance > RING_RADIUS].mean())}
 
 
 def recognition(pairs: Pairs, score: np.ndarray) -> dict[str, float]:
@@ -223,9 +256,12 @@ def run(options: argparse.Namespace) -> None:
         zoom = zoom_of(camera.fov, network.config.view) if told else 1.0
         said = look(network, images, pairs, zoom)
         rows[name] = judge(pairs, said.co_visible.numpy(), said.position.numpy(),
-                           said.heading.numpy(), said.co_visible.numpy() > 0)
-    for name in FEATURES if options.features else ():
-        rows[name] = judge(pairs, inliers(name, sequence, pairs.chosen)[pairs.first, pairs.second])
+                           said.heading.numpy(), said.co_visible.numpy() > 0,
+                           said.arrived.numpy())
+    for name in options.features:
+        for kind, counts in matched(name, sequence, pairs.chosen).items():
+            score = counts[pairs.first, pairs.second]
+            rows[f'{name}, {kind}'] = judge(pairs, score) | sure(pairs, score)
     print_table(rows)
     result = {'checkpoint': str(options.checkpoint), 'pairs': len(pairs.first), 'sight': rows}
     if options.drive:
@@ -250,7 +286,8 @@ def main() -> int:
     parser.add_argument('--cameras', nargs='+', default=['width'], metavar='CAMERA',
                         help='the first one drives')
     parser.add_argument('--every', type=int, default=EVERY, help='photographs: every so many')
-    parser.add_argument('--features', action='store_true', help='judge local features as well')
+    parser.add_argument('--features', nargs='+', choices=FEATURES, default=(),
+                        help='judge local features of the photographs as well')
     parser.add_argument('--no-drive', dest='drive', action='store_false')
     parser.add_argument('--episodes', type=int, default=60)
     parser.add_argument('--decisions', type=int, default=100, help='of an episode, at most')

@@ -79,6 +79,11 @@ def still(topic, kind, time, _):
     return topic, kind, time, odometry(time - 1_000_000, 0.0)
 
 
+def longer(topic, kind, time, message):
+    message.k[0] = 2 * message.width  # 28 deg
+    return topic, kind, time, message
+
+
 def slow(topic, kind, time, message):
     return (topic, kind, time, message) if (time - START) // 50_000_000 % 5 == 0 else None
 
@@ -181,6 +186,11 @@ def test_a_camera_too_narrow_for_the_policy_is_an_error(tmp_path):
     found = diagnose(path, fov=math.radians(120))
     assert [(f.topic, f.severity) for f in found.findings] == [('/camera_info', ERROR)]
     assert '90 deg' in found.findings[0].what and '120' in found.findings[0].what
+    assert diagnose(path, fov=math.radians(120), any_lens=True).findings == []
+    narrow = write(tmp_path / 'b.mcap', changed(drive(), '/camera_info', longer))
+    found = diagnose(narrow, fov=math.radians(90), any_lens=True)
+    assert [(f.topic, f.severity) for f in found.findings] == [('/camera_info', ERROR)]
+    assert 'horizontally' in found.findings[0].what
 
 
 def test_a_standing_robot_may_show_the_same_picture(tmp_path):

@@ -21,6 +21,7 @@ from vn_nav.evaluation.metrics import Episode
 from vn_nav.observation import needed_side
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.report import tables
 from vn_nav.report.evaluation_page import choose, evaluation_page, outcome
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
@@ -213,6 +214,22 @@ def test_a_wider_camera_shows_the_network_what_its_own_would():
     seen = PolicyActor(usual, network, 'greedy', 0, camera_fov=own)
     assert seen._own(same['image']) is same['image']
     assert actor(observation, info['reset']).shape == (4,)  # goals are cropped as well
+
+
+def test_a_narrower_camera_tells_the_policy_that_searches_its_zoom():
+    size, own, narrow = 40, math.radians(90), RobotSpec(camera_fov=math.radians(60))
+    torch.manual_seed(0)
+    network = build_policy(NetworkConfig(
+        actions=DRIVE_ACTIONS, moves=narrow.with_actions(DRIVE_ACTIONS).moves, size=size,
+        architecture='search', channels=(8, 12, 8), features=24, blocks=1, view=own,
+        footprint=narrow.footprint_radius))
+    env = NavigationEnv(EnvConfig(scenes=('house:7',), num_envs=2, size=size), narrow)
+    actor = PolicyActor(env, network, 'greedy', 0, camera_fov=own)
+    observation, info = env.reset(seed=0)
+    actor(observation, info['reset'])
+    bearings = actor.policy.search.searchers[0].bearings
+    edge = math.degrees(math.atan(31 / 32 * math.tan(math.radians(30))))
+    assert np.degrees(bearings[[0, -1]]) == pytest.approx([edge, -edge])
 
 
 def test_the_policy_declares_where_its_head_says_so():

@@ -135,6 +135,7 @@ def test_the_squeezed_place_is_what_the_known_lens_would_show():
     zoom = 1.8
     true = bearings_through(BEARINGS, zoom)
     normal, off = np.array([math.cos(0.4), math.sin(0.4)]), 2.5
+
     def wall(direction, scale):
         return off / (normal[0] * scale * np.cos(direction) + normal[1] * np.sin(direction))
     through_long = wall(true, 1.0)

@@ -79,8 +79,9 @@ def run_doctor(args) -> int:
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise UserError('a file is written into a folder that exists', str(args.json),
                         'make the folder, or choose another place')
+    fov, any_lens = _camera(args.checkpoint, args.robot)
     diagnosis = diagnose(args.bag, topics=load_topics(args.topics) if args.topics else None,
-                         fov=_field_of_view(args.checkpoint, args.robot))
+                         fov=fov, any_lens=any_lens)
     _print(diagnosis)
     if args.json is not None:
         figures = {**dataclasses.asdict(diagnosis), 'usable': diagnosis.usable}
@@ -150,15 +151,18 @@ def _topics(path: Path | None):
     return load_topics(path) if path else Topics()
 
 
-def _field_of_view(checkpoint: Path | None, robot: Path | None) -> float | None:
-    """What the camera has to see [rad]; None: nobody has said."""
+def _camera(checkpoint: Path | None, robot: Path | None) -> tuple[float | None, bool]:
+    """What the camera has to see [rad], and whether less will do; None: nobody has said."""
     if checkpoint is not None:
         from vn_nav.policy.checkpoint_info import read_config
-        return math.radians(read_config(checkpoint)[1]['camera_fov_deg'])
+        from vn_nav.policy.network_config import SEARCH
+        whole, info = read_config(checkpoint)
+        return (math.radians(info['camera_fov_deg']),
+                whole['network'].get('architecture') == SEARCH)
     if robot is not None:
         from vn_nav.robot import load_robot
-        return load_robot(robot).camera_fov
-    return None
+        return load_robot(robot).camera_fov, False
+    return None, False
 
 
 def _print(diagnosis) -> None:

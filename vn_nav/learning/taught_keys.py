@@ -91,9 +91,9 @@ def recall_drive(network: SearchPolicy, pictures: np.ndarray, poses: np.ndarray,
     seen = np.where(grid.stood, np.maximum(grid.seen, 1.0), grid.seen).astype(np.float32)
     inside = np.argwhere(seen > 0)
     (r0, c0), (r1, c1) = inside.min(axis=0), inside.max(axis=0) + 1
+    layers = {name: np.ascontiguousarray(layer[r0:r1, c0:c1], np.float32)
+              for name, layer in (('log_odds', log_odds), ('seen', seen), ('lane', lane))}
     return TaughtPlace(
-        np.ascontiguousarray(pictures[keys]), poses[keys].astype(np.float32),
-        *(np.ascontiguousarray(layer[r0:r1, c0:c1], np.float32)
-          for layer in (log_odds, seen, lane)),
-        (grid.origin + CELL * np.array([c0, r0])).astype(np.float32),
-        np.array([zoom], np.float32))
+        pictures=np.ascontiguousarray(pictures[keys]), poses=poses[keys].astype(np.float32),
+        origin=(grid.origin + CELL * np.array([c0, r0])).astype(np.float32),
+        zoom=np.array([zoom], np.float32), **layers)

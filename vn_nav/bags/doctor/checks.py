@@ -31,9 +31,10 @@ class _Doctor:
     Args:
         topics: the names of the roles.
         fov: field of view that the policy needs [rad]; None: not asked.
+        any_lens: see `ContentChecks`.
     """
 
-    def __init__(self, topics: Topics, fov: float | None):
+    def __init__(self, topics: Topics, fov: float | None, any_lens: bool):
         self._roles = {name.strip('/'): role for role, name in dataclasses.asdict(topics).items()}
         for role in ('goal', 'image'):
             self._roles.setdefault(f'{getattr(topics, role).strip("/")}/compressed', role)
@@ -43,7 +44,7 @@ class _Doctor:
         self._add = self.findings.add
         self.start: int | None = None
         self.end = 0
-        self._contents = ContentChecks(self.findings, fov)
+        self._contents = ContentChecks(self.findings, fov, any_lens)
         self._poses = Neighbours(1e9 * STAMP_WINDOW_S)
 
     def add(self, message: Message) -> None:
@@ -123,19 +124,21 @@ class _Doctor:
 
 
 def diagnose(path: str | Path, *, topics: Topics | None = None, fov: float | None = None,
-             listen: Callable[[Message], None] | None = None) -> Diagnosis:
+             any_lens: bool = False, listen: Callable[[Message], None] | None = None
+             ) -> Diagnosis:
     """Read a bag once and say what is wrong with it.
 
     Args:
         path: a rosbag2 folder or an MCAP file, damaged or not.
         topics: the names of camera, odometry and so on in the bag.
         fov: field of view that the policy needs [rad]; None: cameras are not compared with it.
+        any_lens: whether the policy also drives by narrower cameras.
         listen: is called with every message, in the order of the files.
 
     Raises:
         BagError: it is no bag.
     """
-    bag, doctor = Bag(path, strict=False), _Doctor(topics or Topics(), fov)
+    bag, doctor = Bag(path, strict=False), _Doctor(topics or Topics(), fov, any_lens)
     for message in bag.messages():
         doctor.add(message)
         if listen is not None:

@@ -21,7 +21,7 @@ from vn_nav.bags.doctor.figures import (
     ReceivedTopic,
 )
 from vn_nav.errors import UserError
-from vn_nav.observation import crop_fraction
+from vn_nav.observation import check_lens, crop_fraction, fov_across
 
 PICTURE_PERIOD_NS = 500_000_000  # ns between pictures that are decoded
 BLACK_LEVEL = 16  # of 255: no pixel of a picture's thumbnail is brighter
@@ -37,14 +37,15 @@ class ContentChecks:
     Args:
         findings: gets what is wrong.
         fov: field of view that the policy needs [rad]; None: not asked.
+        any_lens: whether it also drives by narrower cameras, see `through_lens`.
 
     Attributes:
         odometry: how far the robot has gone.
         command: how far the commands would have moved it.
     """
 
-    def __init__(self, findings: Findings, fov: float | None):
-        self._add, self._fov = findings.add, fov
+    def __init__(self, findings: Findings, fov: float | None, any_lens: bool = False):
+        self._add, self._fov, self._any_lens = findings.add, fov, any_lens
         self.odometry, self.command = Motion(), Command()
         self._lens: tuple[float, int, int] | None = None  # focal length, width, height [pixels]
 
@@ -132,11 +133,14 @@ class ContentChecks:
         elif self._fov is not None:
             fov = field_of_view(*lens[1:], lens[0])
             try:
-                crop_fraction(fov, self._fov)
+                if self._any_lens:
+                    check_lens(fov_across(fov, lens[1] / lens[2]))
+                else:
+                    crop_fraction(fov, self._fov)
             except UserError as error:
                 self._add(ERROR, name, 'narrow', f'is of a camera with '
-                          f'{math.degrees(fov):.0f} deg on its shorter side, and the policy needs '
-                          f'{math.degrees(self._fov):.0f}', at, error.remedy)
+                          f'{math.degrees(fov):.0f} deg on its shorter side: {error.rule}', at,
+                          error.remedy)
 
 
 def _short(text: str) -> str:

@@ -10,8 +10,10 @@ import numba
 import numpy as np
 
 from vn_nav.policy.search.grid import CELL, OccupancyGrid
+from vn_nav.policy.search.measured import free_of_points
 
 KEEP = 0.04  # m beyond the footprint that is passable: a cell's edge is half a cell off
+SCAN_KEEP = 0.015  # m, the same of what a scan shows exactly
 KEEP_OFF = 0.2  # m beyond the footprint within which a way costs more
 CLOSE_COST = 2.0  # of it: this many metres more for a metre, at the footprint
 UNKNOWN_COST = 2.0  # the same for floor that nobody has seen or measured
@@ -96,8 +98,22 @@ class Costmap:
         Args:
             pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
         """
-        return free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
-                            float(pose[1]), angle, length)
+        got, clear = free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
+                                 float(pose[1]), angle, length)
+        exact, room = self.scanned_length(pose, angle, length)
+        return min(got, exact), min(clear, room)
+
+    def scanned_length(self, pose: np.ndarray, angle: float, length: float
+                       ) -> tuple[float, float]:
+        """As `free_length`, by the newest scan alone, which is finer than cells.
+
+        Returns:
+            The whole length and infinity where a picture came since.
+        """
+        if self.grid.points is None:
+            return length, math.inf
+        return free_of_points(self.grid.points, float(pose[0]), float(pose[1]), angle, length,
+                              self.grid.footprint + SCAN_KEEP)
 
 
 @numba.njit(cache=True)

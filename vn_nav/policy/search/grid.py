@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from vn_nav.measured_ranges import Scan
-from vn_nav.policy.search.measured import enter_scan, look_over
+from vn_nav.policy.search.measured import ends_of, enter_scan, look_over
 
 CELL = 0.1  # m
 SIDE = 320  # cells
@@ -57,6 +57,7 @@ class OccupancyGrid:
         prior: of somebody who knows the place, for cells that the robot has not seen itself; None:
             nobody, or the map has moved.
         origin: [2] m, of the lower left corner.
+        points: [K,2] m where the rays of the newest scan end; None: a picture came since.
     """
 
     def __init__(self, footprint: float, side: int = SIDE, middle: Sequence[float] = (0.0, 0.0)):
@@ -69,6 +70,7 @@ class OccupancyGrid:
         self.been = np.zeros((side, side), bool)
         self.contacts = np.zeros((side, side), bool)
         self.origin = np.asarray(middle, float) - CELL * side / 2
+        self.points: np.ndarray | None = None
         self.prior: Prior | None = None
         self._prior_counts = True
 
@@ -84,6 +86,7 @@ class OccupancyGrid:
                 one farther than the last.
         """
         self._follow(pose)
+        self.points = None
         spread = np.abs(np.gradient(bearings)).mean()
         _integrate(self.log_odds, self.seen, self.origin, np.asarray(pose, float),
                    np.asarray(bearings, float), float(spread), np.asarray(ranges, float),
@@ -108,6 +111,7 @@ class OccupancyGrid:
         enter_scan(self.log_odds, self.measured, self.origin, CELL, at, scanner.bearings,
                    scan.ranges.astype(float), scanner.nearest, scanner.clear_from,
                    min(scanner.farthest, SCAN_REACH), FREE_WEIGHT, HIT_WEIGHT, MOST)
+        self.points = ends_of(scan, at, SCAN_REACH)
         angles = pose[2] + np.asarray(bearings, float)
         look_over(self.seen, self.measured, self.obstacles(), self.origin, CELL, pose[0], pose[1],
                   angles, REACH, SUB_RAYS)

@@ -104,4 +104,3 @@ def _shifted(log_probabilities: Tensor, logs: Tensor) -> Tensor:
     one = torch.ones_like(read[..., :1])
     probabilities = torch.diff(torch.cat([0 * one, read, one], -1), dim=-1)
     return probabilities.clamp(min=1e-7).log()
-
