@@ -94,6 +94,7 @@ setup(
         'miniworld': ['miniworld>=2.1'],
         'vizdoom': ['vizdoom>=1.2.4'],
         'mesh': ['pillow>=10'],  # the textures of OBJ, GLB and glTF files
+        'film': ['pillow>=10.1'],  # `vn_nav film`
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`
         'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels

@@ -42,7 +42,7 @@ DRIVE_SEED = 2026
 CHOICE = 8  # pictures of the bag; the one that shows most becomes a goal
 
 
-def drive(options) -> None:
+def drive(options) -> dict[str, list[Episode]]:
     """Episodes to pictures out of the bag, a row each."""
     out = options.out
     folders = {RIGHT: out / 'goals', OTHER: out / 'other_goals'}
@@ -70,6 +70,7 @@ def drive(options) -> None:
                                         'checkpoint': str(options.checkpoint),
                                         'machine': machine()})
     print_rows({options.stop: figures}, f'house {options.house}, pictures out of the bag')
+    return episodes
 
 
 def choose_goals(options, shown: RecordedDrive) -> list[GoalPicture]:

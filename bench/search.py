@@ -6,17 +6,18 @@
 
 Every row is measured as `vn_nav evaluate` does, on the same starts, and kept as JSON in `--out`
 as soon as it is finished: a second run goes on where the first one was ended, and measures again
-what was measured of other weights or other numbers. Rows may be divided among processes
-(`--rows`). Prints a Markdown table, ready for docs/results.md.
+what was measured of other weights, another planner or other numbers. Rows may be divided among
+processes (`--rows`). Prints a Markdown table, ready for docs/results.md.
 
 - **validation**, **test**, **unseen_look**: houses that no training saw; arrival, declared stop.
 - **wrong**, **absent**, **blank**, **random**, **explorer**, **shortest**: the controls, in the
   houses of `--split`. Of a wrong picture (of another goal of the house) some stops are where that
   was taken; of an absent one (of another house) every stop is false.
 - **rough**, **plain**: light, camera and base vary more, or not at all; **true**, **commanded**,
-  **none**: odometry other than drifting; **low**, **high**, **narrow**, **wide**: cameras 0.4 and
-  1.4 m high, fields of view of 70 and 110 degrees (`bench/robots`), of a policy that was trained
-  with another. All in the houses of `--split`, declared stop alone.
+  **none**: odometry other than drifting; **scan**, **depth**: measured ranges for the map;
+  **low**, **high**, **narrow**, **wide**: cameras 0.4 and 1.4 m high, fields of view of 70 and 110
+  degrees (`bench/robots`), of a policy that was trained with another. All in the houses of
+  `--split`, declared stop alone.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
+import hashlib
 import json
 import sys
 import time
@@ -36,8 +38,14 @@ from vn_nav.cli.world import load_for, machine, make_env_for
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.evaluator import ARRIVAL, DECLARED, STOPS
-from vn_nav.evaluation.measurement import EvaluateConfig, measure_checkpoint, odometry_for
+from vn_nav.evaluation.measurement import (
+    EvaluateConfig,
+    measure_checkpoint,
+    odometry_for,
+    ranges_for,
+)
 from vn_nav.files import write_file
+from vn_nav.policy import search
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.report import tables
 from vn_nav.report.tables import number
@@ -45,6 +53,7 @@ from vn_nav.robot import load_robot
 from vn_nav.scenes import rooms_of
 
 ROBOTS = Path(__file__).resolve().parent / 'robots'
+SEARCH = Path(search.__file__).parent  # what decides is no part of a checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +67,7 @@ class Row:
     randomisation: str | None = None
     odometry: str | None = None
     robot: str | None = None  # a file of `ROBOTS`
+    ranges: str | None = None
 
 
 ROWS = {
@@ -76,6 +86,8 @@ ROWS = {
     'true': Row('odometry: true', odometry='true'),
     'commanded': Row('odometry: commanded', odometry='commanded'),
     'none': Row('odometry: none', odometry='none'),
+    'scan': Row('map by a LaserScan', ranges='scan'),
+    'depth': Row('map by a depth camera', ranges='depth'),
     'low': Row('camera 0.4 m high', robot='low'),
     'high': Row('camera 1.4 m high', robot='high'),
     'narrow': Row('field of view 70 deg', robot='narrow'),
@@ -86,13 +98,16 @@ ROWS = {
 def conditions(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> dict:
     """What a row's figures depend on; what was measured under others is measured again."""
     info = checkpoint.info
-    return {'sha256': info['sha256'], 'split': row.split or options.split,
-            'houses': options.houses, 'episodes': options.episodes, 'seed': options.seed,
+    planner = hashlib.sha256(b''.join(path.read_bytes() for path in sorted(SEARCH.glob('*.py'))))
+    return {'sha256': info['sha256'], 'planner': planner.hexdigest(),
+            'split': row.split or options.split, 'houses': options.houses,
+            'episodes': options.episodes, 'seed': options.seed,
             'max_decisions': options.max_decisions, 'stops': list(row.stops),
             'stop_threshold': (info['stop_threshold'] if options.stop_threshold is None
                                else options.stop_threshold),
             'randomisation': row.randomisation or info['randomisation'],
             'odometry': odometry_for(checkpoint.network, row.odometry),
+            'ranges': ranges_for(checkpoint.network, row.ranges),
             'camera': row.robot or 'as trained', 'control': row.control}
 
 
@@ -105,12 +120,13 @@ def finished(path: Path, wanted: dict) -> dict | None:
     return found if found.get('conditions') == wanted else None
 
 
-def measure(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> dict:
-    """Figures of a row by kind of stop; without those that it has not.
+def measured(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> dict:
+    """A row's `figures` by kind of stop, and what they took.
 
     Raises:
         UserError: the policy, or this simulator, cannot be measured so.
     """
+    begun = time.monotonic()
     robot = ROBOTS / f'{row.robot}.yaml' if row.robot else None
     info = checkpoint.info
     scenes = split_scenes(info['simulator'], row.split or options.split, options.houses,
@@ -119,15 +135,17 @@ def measure(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespace)
     def make(names, environments: int, stop: str):
         return make_env_for(checkpoint, names, environments, stop=stop, robot=robot, own=False,
                             randomisation=row.randomisation, odometry=row.odometry,
-                            max_decisions=options.max_decisions)
+                            max_decisions=options.max_decisions, ranges=row.ranges)
     if robot:
         load_for(options.checkpoint, robot, any_camera=True)  # it has the policy's actions
-    measured = measure_checkpoint(checkpoint, scenes, make, EvaluateConfig(
+    rows = measure_checkpoint(checkpoint, scenes, make, EvaluateConfig(
         episodes=options.episodes, seed=options.seed, stops=row.stops, policy=row.control is None,
         controls=() if row.control is None else (row.control,),
         stop_threshold=options.stop_threshold, robot=load_robot(robot) if robot else None))
-    return {stop: next(iter(rows.values())) for stop, rows in
-            evaluator.figures(measured).items() if rows}
+    return {'figures': {stop: next(iter(own.values()))
+                        for stop, own in evaluator.figures(rows).items() if own},
+            'minutes': round((time.monotonic() - begun) / 60, 1), 'machine': machine(),
+            'date': datetime.date.today().isoformat()}
 
 
 def markdown(found: dict[str, dict]) -> str:
@@ -183,24 +201,22 @@ def main() -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         found: dict[str, dict] = {}
         for name, row in ROWS.items():
-            path, wanted = options.out / f'{name}.json', conditions(row, checkpoint, options)
-            entry = finished(path, wanted)
-            if entry is None and name in options.rows and not options.only_print:
-                begun = time.monotonic()
-                try:
-                    figures = measure(row, checkpoint, options)
-                except UserError as error:
+            path, asked = options.out / f'{name}.json', name in options.rows
+            try:
+                wanted = conditions(row, checkpoint, options)
+                entry = finished(path, wanted)
+                if entry is None and asked and not options.only_print:
+                    entry = {'row': name, 'checkpoint': str(options.checkpoint),
+                             'conditions': wanted, **measured(row, checkpoint, options)}
+                    write_file(path, (json.dumps(entry, indent=2) + '\n').encode())
+                    for stop, own in entry['figures'].items():
+                        print(tables.row_line(f'{name}, {tables.TITLES[stop].lower()}', own, stop),
+                              flush=True)
+            except UserError as error:
+                if asked:
                     print(f'{name}: {error}', file=sys.stderr, flush=True)
                     refused += 1
-                    continue
-                entry = {'row': name, 'checkpoint': str(options.checkpoint),
-                         'conditions': wanted, 'figures': figures, 'machine': machine(),
-                         'minutes': round((time.monotonic() - begun) / 60, 1),
-                         'date': datetime.date.today().isoformat()}
-                write_file(path, (json.dumps(entry, indent=2) + '\n').encode())
-                for stop, own in figures.items():
-                    print(tables.row_line(f'{name}, {tables.TITLES[stop].lower()}', own, stop),
-                          flush=True)
+                continue
             if entry is not None:
                 found[name] = entry
     except UserError as error:

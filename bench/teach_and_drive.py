@@ -5,6 +5,9 @@
     python bench/teach_and_drive.py --out teach_and_drive --stage teach --minutes 30
     python bench/teach_and_drive.py --out teach_and_drive --stage drive --rows before after
     python bench/teach_and_drive.py --out teach_and_drive --stage drive --without-ros --seed 7
+    # A policy that searches, in three houses, where it has to say that it has arrived.
+    python bench/teach_and_drive.py --out three --house 12000 12001 10000 --minutes 5 \
+      --checkpoint models/search --stop declared --without-ros --rows before after 'wrong picture'
 
 - **record**: `sim_bridge_node` with a house of the split "unseen look", a camera at another height
   than the policy's and drifting odometry; a joystick (`vn_sim_bridge.robot.joystick`) that
@@ -18,7 +21,7 @@
 
 The joystick's robot has no motion noise: in the simulator no odometry sees that noise (2 deg a
 turn of 30 deg: 44 deg in ten minutes of turning around). `--drift` stands in its place, as a base
-with encoders and a gyro has it.
+with encoders and a gyro has it. Several houses have a folder each, and `result.json` is of all.
 """
 
 from __future__ import annotations
@@ -35,7 +38,9 @@ from record_drive import record, run_command, write_figures
 from vn_nav.cli.world import machine
 from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import ARRIVAL
+from vn_nav.evaluation.metrics import summarise
 from vn_nav.nodes.processes import ProcessFailure
+from vn_nav.report.tables import print_rows
 from vn_nav.resources import share_file
 from vn_sim_bridge.navigation.env_config import STOPS
 
@@ -56,13 +61,24 @@ def teach(options) -> None:
         'command': ' '.join(['vn_nav', *arguments])})
 
 
+def together(options, houses: dict[int, dict]) -> None:
+    """Figures of all houses: of as many episodes each."""
+    rows = {row: summarise([episode for own in houses.values() for episode in own[row]])
+            for row in options.rows}
+    write_figures(options.out / 'result.json', {
+        'stop': options.stop, 'houses': list(houses), 'rows': rows, 'machine': machine(),
+        'checkpoint': str(options.checkpoint), 'seed': options.seed})
+    print_rows({options.stop: rows}, f'houses {", ".join(map(str, houses))}')
+
+
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--out', type=Path, required=True, help='folder for everything')
     parser.add_argument('--stage', choices=STAGES, help='only this one')
     parser.add_argument('--checkpoint', type=Path, default=share_file('models/anywhere'))
-    parser.add_argument('--house', type=int, default=12_000, help='12000 on: unseen look')
+    parser.add_argument('--house', type=int, nargs='+', default=[12_000],
+                        help='12000 on: unseen look')
     parser.add_argument('--rooms', type=int, default=5)
     parser.add_argument('--camera-height', type=float, default=0.6, help='m')
     parser.add_argument('--randomisation', default='standard')
@@ -81,10 +97,19 @@ def main() -> int:
     parser.add_argument('--stop', choices=STOPS, default=ARRIVAL, help='what ends an episode')
     parser.add_argument('--rows', nargs='+', choices=ROWS, default=ROWS)
     options = parser.parse_args()
+    driven: dict[int, dict] = {}
     try:
-        for stage in STAGES:
-            if options.stage in (None, stage):
-                {'record': record, 'teach': teach, 'drive': drive}[stage](options)
+        for house in options.house:
+            own = argparse.Namespace(**{**vars(options), 'house': house})
+            if len(options.house) > 1:
+                own.out = options.out / f'house_{house}'
+            for stage in STAGES:
+                if options.stage in (None, stage):
+                    done = {'record': record, 'teach': teach, 'drive': drive}[stage](own)
+                    if done is not None:
+                        driven[house] = done
+        if len(driven) > 1:
+            together(options, driven)
     except (UserError, ProcessFailure) as error:
         print(f'{error}; logs are in {options.out / "logs"}', file=sys.stderr)
         return 1

@@ -48,6 +48,12 @@ def _config(folder):
     (['evaluate', 'models/house', '--bag', 'bags/house_drive', '--goals', '1'], 'four goals'),
     (['evaluate', 'models/house', '--margin', '0.2'], 'give --bag'),
     (['evaluate', 'models/house', '--odometry', 'true'], 'policies that use it'),
+    (['evaluate', 'models/house', '--robot', 'bench/robots/narrow.yaml'], '90 deg'),
+    (['film', '/nowhere', '--out', 'OUT.gif'], 'checkpoint'),
+    (['film', 'models/search', '--out', 'OUT.png'], '.gif'),
+    (['film', 'models/search', '--out', 'OUT/film.gif'], 'folder'),
+    (['film', 'models/house', '--scene', 'house:7?rooms=1', '--stop', 'arrival', '--out',
+      'OUT.gif'], 'searches'),
     (['compare', '/nowhere', '--out', 'OUT'], '.html'),
     (['train', '--backend', 'thor', '--out', 'OUT'], 'backend'),
     (['train', '--rooms', '99', '--out', 'OUT'], 'rooms'),
@@ -94,7 +100,7 @@ def test_evaluate_prints_figures(tmp_path, capsys):
     result = json.loads(figures.read_text())
     assert list(result['splits']) == ['seen_goals'] and result['decoding'] == 'sample'
     rows = result['splits']['seen_goals']['rows']['arrival']
-    assert len(rows) == 6 and all(row['episodes'] == 6 for row in rows.values())
+    assert len(rows) == 7 and all(row['episodes'] == 6 for row in rows.values())
     assert page.read_text().count('<svg') == 6
 
 

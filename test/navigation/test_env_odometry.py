@@ -183,6 +183,9 @@ def test_a_single_robot_has_it_as_well():
     turn = env._batch.action_names.index('rotate_left')
     observation, *_ = env.step(turn)
     assert observation['odometry'] == pytest.approx([0.0, 0.0, math.radians(30)])
+    env = Navigation('house:7?rooms=2', size=16, ranges='scan')
+    observation = env.reset(seed=0)[0]
+    assert observation['scan'].shape == (360,) and env.observation_space.contains(observation)
     assert 'odometry' not in Navigation('house:7?rooms=2', size=16).reset(seed=0)[0]
 
 

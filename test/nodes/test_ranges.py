@@ -109,10 +109,11 @@ def test_measured_ranges_reach_the_map(watcher, tmp_path, sensor):
                          for i in (0, 1))).min(1)
         near = 0.12 if sensor == 'scan' else 0.35
         assert len(walls) > 30 and np.mean(gap < near) > 0.9
-        free = cells_of(message, (cells >= 0) & (cells < 20), start)
+        free = cells_of(message, (cells >= 0) & (cells < 40), start)
         inside = ((free[:, None] > rects[None, :, :2] + 0.1)
                   & (free[:, None] < rects[None, :, 2:] - 0.1)).all(2).any(1)
-        assert len(free) > 100 and np.mean(inside) < 0.02
+        # A camera clears nothing nearer than 0.85 m, and it begins before a table.
+        assert len(free) > (100 if sensor == 'scan' else 10) and np.mean(inside) < 0.02
 
 
 @pytest.mark.parametrize(('options', 'words'), [

@@ -167,7 +167,7 @@ def test_the_map_is_drawn_through_the_lens_of_the_robot(checkpoint):
     for zoom in (1.0, 2.0):
         runtime = PolicyRuntime(folder)
         runtime.set_goal(picture)
-        runtime.act(picture, None, zoom)
+        runtime.act(picture, zoom=zoom)
         searcher = runtime.search.searchers[0]
         assert np.allclose(searcher.bearings, bearings_through(BEARINGS, zoom))
         known.append(searcher.grid.known_area())

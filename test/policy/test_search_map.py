@@ -12,6 +12,7 @@ from vn_nav.policy.search.costmap import Costmap
 from vn_nav.policy.search.grid import CELL, SIDE, OccupancyGrid, on_robot
 from vn_nav.policy.search.hypotheses import Hypotheses, Hypothesis, apart, on_map
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, column_bearings
+from vn_nav.policy.search.measured import free_of_points
 from vn_nav.policy.search.searcher import Searcher, Sight
 
 BEARINGS = column_bearings(math.pi / 2)
@@ -443,3 +444,27 @@ def test_with_a_scan_it_drives_round_what_the_pictures_do_not_show():
                 pose = moved
         return met
     assert contacts(with_scan=True) == 0 < contacts(with_scan=False)
+
+
+def test_a_scan_says_exactly_how_far_a_straight_line_is_free():
+    grid, pose = OccupancyGrid(0.18), np.array([0.0, 0.0, 0.0])
+    grid.add_scan(pose, scanned(pose, half=0.601, ray=0.5), BEARINGS)
+    grid.log_odds[grid.obstacles()] = 0.0  # by the map all is free
+    costmap = Costmap(grid)
+    got, clear = costmap.free_length(pose, 0.0, 0.5)
+    assert (got, clear) == pytest.approx((0.601 - 0.195, 0.195), abs=1e-3)
+    assert costmap.free_length(pose, 0.0, 0.3)[0] == 0.3
+    grid.add_ranges(pose, BEARINGS, one_hot(np.full(COLUMNS, 6.0)), RANGE_EDGES)
+    assert grid.points is None  # what a scan has shown exactly is of its picture alone
+
+
+@pytest.mark.parametrize(('points', 'length', 'got', 'clear'), [
+    ([[1.0, 0.0]], 0.5, 0.5, 0.5), ([[0.6, 0.0]], 0.5, 0.4, 0.2),
+    ([[0.4, 0.19]], 0.5, 0.3376, 0.2), ([[0.4, 0.21]], 0.5, 0.5, 0.21),
+    ([[-0.1, 0.0], [-0.05, 0.1]], 0.5, 0.5, math.inf), ([[0.1, 0.0]], 0.5, 0.0, 0.1)])
+def test_a_disc_gets_as_far_as_the_first_point(points, length, got, clear):
+    turn = 0.7
+    turned = np.array(points) @ [[math.cos(turn), math.sin(turn)],
+                                 [-math.sin(turn), math.cos(turn)]]
+    found = free_of_points(turned + [3.0, -2.0], 3.0, -2.0, turn, length, 0.2)
+    assert found == pytest.approx((got, clear), abs=1e-4)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.measured_ranges import laser_scan
 from vn_nav.observation import Observation
 from vn_nav.policy.action_filter import BLOCKED_ACTIONS, NONE
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
@@ -15,7 +16,7 @@ from vn_nav.policy.export import export_onnx
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.runtime import _check_stop_threshold
-from vn_nav.policy.search import costmap, grid
+from vn_nav.policy.search import approach, costmap, grid, lookahead, measured
 from vn_nav.policy.search.driver import SearchDriver
 from vn_nav.policy.search.look import (
     BINS,
@@ -176,17 +177,20 @@ def test_what_a_configuration_must_not_say(changes, rule):
 
 def test_nothing_is_compiled_while_a_robot_drives():
     """Decisions have 0.1 s: whoever makes the driver waits for the compiler, once."""
-    kernels = (grid._integrate, grid._disc, grid._expect, costmap._dijkstra,
-               costmap._free_length)
+    kernels = (grid._integrate, grid._disc, grid._expect, costmap._dijkstra, costmap.free_length,
+               lookahead.best_turns, approach.best_move, measured.enter_scan, measured.look_over,
+               measured.free_of_points)
     driver = SearchDriver(build_policy(CONFIG), 2)
     before = [set(kernel.signatures) for kernel in kernels]
     assert all(before)
     rng = np.random.default_rng(0)
     last, starts = np.full(2, -1), np.ones(2, bool)
     goals = driver.network.encode_goals(torch.zeros(2, 3, 48, 48, dtype=torch.uint8))
-    for _ in range(30):
+    for k in range(30):
         image = rng.integers(0, 256, (2, 3, 48, 48), dtype=np.uint8)
-        last = driver.act(image, goals, last, starts, rng.normal(0, 1, (2, 3)))
+        scans = None if k % 2 else [laser_scan(rng.uniform(0.5, 6, 360), -math.pi,
+                                               math.radians(1), 0.1, 12.0), None]
+        last = driver.act(image, goals, last, starts, rng.normal(0, 1, (2, 3)), scans)
         starts = np.zeros(2, bool)
         assert ((last >= 0) & (last < len(CONFIG.actions))).all()
     assert [set(kernel.signatures) for kernel in kernels] == before

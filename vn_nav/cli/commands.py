@@ -22,6 +22,7 @@ COMMANDS = {
     'pretrain': 'pre-train a policy on recorded bags',
     'teach': 'learn the place where a bag was driven, in its pictures',
     'evaluate': 'measure a checkpoint',
+    'film': 'film an episode of a policy that searches, with its map',
     'compare': "plot several runs' learning curves",
     'publish': 'measure a run and write it as a checkpoint to ship',
     'export': 'write a checkpoint as ONNX',

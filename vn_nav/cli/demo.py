@@ -31,6 +31,7 @@ from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.nodes.isolation import stay_on_this_host
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.policy.checkpoint import LoadedCheckpoint
+from vn_nav.policy.network_config import SEARCH
 from vn_nav.report.demo_page import kind_of, write_report
 from vn_nav.report.tables import TITLES, number
 from vn_nav.report.terminal import print_table
@@ -51,6 +52,8 @@ STALL = 60.0  # s without a finished episode after which the demo gives up
 RECORDED = ['image_raw', 'camera_info', 'goal_image', 'cmd_vel', 'odom', 'ground_truth/odom',
             'action', 'action_names', 'arrived', 'collision', 'reward', 'episode_end', 'episode',
             'episode_result', 'scene', '/diagnostics']
+# Of the node of a policy that searches: `~/map` and `~/hypotheses`.
+SEARCH_TOPICS = ('map:nav_msgs/msg/OccupancyGrid', 'hypotheses:geometry_msgs/msg/PoseArray')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +119,10 @@ def demonstrate(out: Path, folder: Path | None = None, *, episodes: int = 20,
     processes = Processes(out / 'logs')
     try:
         processes.start('recorder', 'vn_nav.nodes.recorder_node',
-                        {'output': str(out / 'bag'), 'topics': RECORDED})
+                        {'output': str(out / 'bag'), 'topics': RECORDED + [
+                            f'/{_policy(stage)}/{topic}' for stage in stages
+                            if stage.checkpoint.config.architecture == SEARCH
+                            for topic in SEARCH_TOPICS]})
         for index, stage in enumerate(stages):
             _drive(console, processes, stage, start_time=1.0 + 1e5 * index)
     except ProcessFailure as error:
@@ -128,7 +134,8 @@ def demonstrate(out: Path, folder: Path | None = None, *, episodes: int = 20,
         console.print(f'[red]vn_nav demo: {", ".join(processes.killed)} did not end within 10 s '
                       f'of SIGINT and had to be killed[/]; logs are in {out / "logs"}')
         return 1
-    drives = drives_from_bag(out / 'bag', pictures=True)
+    drives = drives_from_bag(out / 'bag', pictures=True,
+                             policies=[_policy(stage) for stage in stages])
     result = _results(drives, stages)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
                'date': datetime.date.today().isoformat()}
@@ -229,7 +236,7 @@ def _drive(console: Console, processes: Processes, stage: Stage, start_time: flo
     """All episodes in one scene."""
     from vn_nav.nodes.demo_watch import DemoWatch
     count = stage.count
-    bridge, policy = f'bridge_{stage.place}', f'policy_{stage.place}'
+    bridge, policy = f'bridge_{stage.place}', _policy(stage)
     note = ('' if stage.place == 'trained'
             else f' (never seen; episodes end at {stage.limit} decisions)')
     console.print(f'\n[bold]{stage.place} {kind_of(stage.scene)}[/], {stage.scene}{note}; '
@@ -259,6 +266,11 @@ def _drive(console: Console, processes: Processes, stage: Stage, start_time: flo
             live.update(_progress(watch.episodes, count))
     processes.stop(policy)
     processes.stop(bridge)
+
+
+def _policy(stage: Stage) -> str:
+    """Name of the policy's node."""
+    return f'policy_{stage.place}'
 
 
 def _stop(info: dict) -> str:

@@ -90,6 +90,7 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
 def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
                  max_decisions: int = 300, goal_seed: int = 0, odometry: str | None = None,
+                 size: int | None = None,
                  ranges: str | None = None,
                  say: Callable[[str], None] = SAY):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
@@ -103,6 +104,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         max_decisions: of an episode.
         goal_seed: 0 for the goals of the training.
         odometry: that the policy is given; None: see `measurement.odometry_for`.
+        size: side of the pictures [pixels]; None: what the policy needs.
         ranges: that its map is given; None: see `measurement.ranges_for`.
         say: receives a line about what the simulator cannot vary.
 
@@ -114,10 +116,11 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
     from vn_nav.observation import needed_side
     from vn_nav.robot import load_robot
     info = checkpoint.info
-    size = checkpoint.config.size
-    if robot is not None:  # which may have another camera: see `PolicyActor`
-        size = needed_side(size, load_robot(robot).camera_fov,
-                           math.radians(info['camera_fov_deg']))
+    if size is None:
+        size = checkpoint.config.size
+        if robot is not None:  # which may have another camera: see `PolicyActor`
+            size = needed_side(size, load_robot(robot).camera_fov,
+                               math.radians(info['camera_fov_deg']))
     env = make_env(scenes, envs, robot=robot, size=size,
                    randomisation=randomisation or info['randomisation'], task=info['task'],
                    objects=info['objects'], actions=checkpoint.config.actions,
@@ -169,12 +172,15 @@ def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False)
     Args:
         path: of the checkpoint.
         robot: file of the robot; None: the one that it was trained for.
-        any_camera: a robot file may have another camera than the policy was trained with.
+        any_camera: a robot file may have another camera than the policy was trained with, as far
+            as the policy can be shown its pictures.
 
     Raises:
         UserError: the robot has other actions or another camera.
     """
+    from vn_nav.observation import check_lens, crop_fraction
     from vn_nav.policy.checkpoint import load_checkpoint
+    from vn_nav.policy.network_config import SEARCH
     from vn_nav.robot import load_robot
     checkpoint = load_checkpoint(path)
     spec = load_robot(robot) if robot else _trained_robot(checkpoint.info)
@@ -182,7 +188,12 @@ def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False)
     spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
     present = math.degrees(spec.camera_fov), spec.camera_height
-    if not (any_camera and robot) and any(
+    if any_camera and robot:
+        if checkpoint.config.architecture == SEARCH:
+            check_lens(spec.camera_fov)
+        else:
+            crop_fraction(spec.camera_fov, math.radians(trained[0]))
+    elif any(
             abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
         raise UserError('the robot has the camera that the policy was trained with: '
                         f'{trained[0]:g} deg, {trained[1]:g} m high',

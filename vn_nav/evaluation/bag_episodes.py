@@ -11,6 +11,7 @@ import bisect
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from vn_msgs_py.images import decode_rgb
 from vn_msgs_py.motion import odometry_to_array
 from vn_nav.bags.storage.reader import Record, read_bag
 from vn_nav.errors import UserError
+from vn_nav.evaluation.bag_searches import PlacedSearch, read_searches
 from vn_nav.evaluation.metrics import Episode
 
 TOPICS = ('scene', 'episode', 'reward', 'collision', 'episode_end', 'ground_truth/odom',
@@ -38,6 +40,8 @@ class RecordedEpisode:
     goal_picture: np.ndarray | None  # [H,W,3] uint8
     # Number of the decision, from 1: the camera picture [H,W,3] uint8 that it was made on.
     pictures: dict[int, np.ndarray]
+    # Likewise, for some decisions: what a policy that searches knew at that picture.
+    searches: dict[int, PlacedSearch]
 
 
 @dataclasses.dataclass
@@ -48,12 +52,14 @@ class Drive:
     episodes: list[RecordedEpisode]
 
 
-def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive]:
+def drives_from_bag(folder: str | Path, *, pictures: bool = False,
+                    policies: Sequence[str] = ()) -> list[Drive]:
     """Every scene of a bag with its finished episodes, in order.
 
     Args:
         folder: of the bag.
         pictures: also decode goal and camera pictures.
+        policies: names of nodes that published their map, if they search.
 
     Raises:
         UserError: no readable bag, or one without the bridge's topics.
@@ -90,9 +96,11 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
 
     poses: list[list[np.ndarray]] = [[] for _ in range(count)]
     posed_at: list[list[int]] = [[] for _ in range(count)]
+    truth: list[list[np.ndarray]] = [[] for _ in range(count)]
     for record in records['ground_truth/odom']:
         values = odometry_to_array(record.message)
         poses[owner_by_stamp(values[6])].append(values[:3])
+        truth[owner_by_stamp(values[6])].append(values)
         posed_at[owner_by_stamp(values[6])].append(record.stamp)
     goal_pictures: list[np.ndarray | None] = [None] * count
     views: list[dict[int, np.ndarray]] = [{} for _ in range(count)]
@@ -105,6 +113,8 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
         number = bisect.bisect_right(judged_at[k], record.stamp) + 1
         if number not in views[k]:
             views[k][number] = decode_rgb(record.message)
+    firsts = [own[0] if own else np.full(7, np.nan) for own in truth]
+    searches = read_searches(folder, policies, begun_at, firsts)
     drives = [Drive(scene, []) for _, scene in scenes]
     for k, (stamp, facts) in enumerate(begins):
         place = max(0, bisect.bisect_right([s for s, _ in scenes], stamp + GRACE) - 1)
@@ -123,7 +133,9 @@ def drives_from_bag(folder: str | Path, *, pictures: bool = False) -> list[Drive
         # After the last episode of all, a robot that stands still goes on to see.
         seen = {number: view for number, view in views[k].items() if number <= len(rewards[k])}
         drives[place].episodes.append(RecordedEpisode(
-            facts, episode, trajectory, goal_pictures[k], seen))
+            facts, episode, trajectory, goal_pictures[k], seen,
+            {bisect.bisect_right(judged_at[k], search.recorded) + 1: search
+             for search in searches[k]}))
     return drives
 
 

@@ -62,10 +62,10 @@ def rows_of(splits: Sequence[str], network: Policy, before: Policy | None) -> li
             for name in ROWS:
                 drives = before if name == BEFORE else network
                 if drives is not None and (stop == evaluator.ARRIVAL
-                                           or 'arrival' in drives.config.heads):
+                                           or drives.config.declares):
                     found.append(Row(split, stop, name))
     return [row for row in found
-            if row.stop == evaluator.ARRIVAL or 'arrival' in network.config.heads]
+            if row.stop == evaluator.ARRIVAL or network.config.declares]
 
 
 def cost_of(make_env: Callable[[int], Any], network: Policy, envs: int) -> Cost:

@@ -12,6 +12,7 @@ from vn_nav.errors import UserError
 from vn_nav.learning.presets import ENVIRONMENT, TrainConfig, check_not_search, preset
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.checkpoint import LoadedCheckpoint
+from vn_nav.policy.network_config import SEARCH
 from vn_nav.robot import RobotSpec
 
 PRESET = 'fast'
@@ -89,7 +90,6 @@ def numbers(job: TeachJob, given: LoadedCheckpoint | None, minutes: float,
                                                    minutes / 3)}
     else:
         network = given.config
-        check_not_search(network.architecture, job.checkpoint)
         if network.architecture == 'icra2017':
             raise UserError('an encoder that learns is taught', f'{job.checkpoint}, whose '
                             'encoder is frozen', 'choose another --checkpoint')
@@ -99,4 +99,6 @@ def numbers(job: TeachJob, given: LoadedCheckpoint | None, minutes: float,
                 **{name: getattr(network, name) for name in (
                     'architecture', 'channels', 'blocks', 'features', 'hidden', 'deconvolutions',
                     'pose_to_memory', 'pixel_mean', 'pixel_std')}}
-    return preset(PRESET, **{'seed': job.seed, 'threads': job.threads, **own, **job.changes})
+    config = preset(PRESET, **{'seed': job.seed, 'threads': job.threads, **own, **job.changes})
+    check_not_search(config.architecture, f'--set architecture={SEARCH}')
+    return config

@@ -43,6 +43,7 @@ from vn_nav.learning.trainer import train
 from vn_nav.learning.training import CHECKPOINT, STATE
 from vn_nav.policy.checkpoint import CONFIG, LoadedCheckpoint, load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
+from vn_nav.policy.network_config import SEARCH
 from vn_nav.robot import DRIVE_ACTIONS, RobotSpec
 from vn_nav.scenes import parse_scene
 
@@ -50,7 +51,7 @@ MIN_PICTURES_PER_CELL = 4  # for each place cell that the policy distinguishes
 # Of all minutes: no round of the search for loop closures begins after this share. Reading the bag
 # takes the time that it needs.
 SEARCH_TIME_SHARE = 0.25
-EVALUATION_TIME_SHARE = 0.25  # of the minutes left after that, at most; learning gets the rest
+EVALUATION_TIME_SHARE = 0.25  # of the minutes left after that, at most
 WRITE_TIME_S = 3.0  # to write what was learned
 # Of learning, for place cells and for paths: where there is nothing else to learn (a policy that
 # finds pictures anywhere needs no more), and before reinforcement learning from nothing.
@@ -85,7 +86,9 @@ def teach(job: TeachJob, place: Place) -> Path:
         raise UserError('a new run has a folder of its own', str(out),
                         'go on there with --resume, or choose another folder')
     given = load_checkpoint(job.checkpoint) if job.checkpoint else None
-    numbers(job, given, job.minutes, job.minutes)  # refuse before hours what would fail then
+    kind = teaching_for(job, given)
+    if kind is Teaching:
+        numbers(job, given, job.minutes, job.minutes)  # refuse before hours what would fail then
     robot = _robot(job, given)
     with Stages(job.minutes) as stages:
         run = None
@@ -94,7 +97,7 @@ def teach(job: TeachJob, place: Place) -> Path:
             graph = read_place(bag, job.options, place.build_graph, robot, size,
                                Path(job.cache or out / 'decoded'), stages,
                                stages.at(SEARCH_TIME_SHARE))
-            run = Teaching(job, place, graph, given, robot, stages)
+            run = kind(job, place, graph, given, robot, stages)
             run.learn()
             run.evaluate()
         except KeyboardInterrupt:
@@ -105,17 +108,36 @@ def teach(job: TeachJob, place: Place) -> Path:
     return run.folder
 
 
+def teaching_for(job: TeachJob, given: LoadedCheckpoint | None) -> type[Teaching]:
+    """How a policy is taught.
+
+    Raises:
+        UserError: numbers of a training for a policy that is taught without one.
+    """
+    if given is None or given.config.architecture != SEARCH:
+        return Teaching
+    if job.changes:
+        raise UserError('a policy that searches is taught without a training',
+                        ', '.join(job.changes), 'leave out --set')
+    from vn_nav.learning.teach_search import SearchTeaching
+    return SearchTeaching
+
+
 def _robot(job: TeachJob, given: LoadedCheckpoint | None) -> RobotSpec:
     """The robot with the actions of the policy."""
     robot = job.robot
     if given is None:
         return robot.with_actions(DRIVE_ACTIONS)
+    if given.config.architecture == SEARCH:
+        # A wider camera's pictures are cropped to the lens that the policy knows.
+        robot = dataclasses.replace(robot, camera_fov=min(robot.camera_fov, given.config.view))
     before = given.info['camera_fov_deg'], given.info['camera_height']
     now = math.degrees(robot.camera_fov), robot.camera_height
     if any(abs(a - b) > 0.01 * b for a, b in zip(now, before, strict=True)):
         print(f'the camera ({now[0]:.0f} deg, {now[1]:g} m high) is not that of the policy '
-              f'({before[0]:.0f} deg, {before[1]:g} m): the policy adapts to it',
-              flush=True)
+              f'({before[0]:.0f} deg, {before[1]:g} m): '
+              + ('what it sees is less exact' if given.config.architecture == SEARCH else
+                 'the policy adapts to it'), flush=True)
     return robot.with_actions(given.config.actions, given.config.moves)
 
 
@@ -129,7 +151,12 @@ class Teaching:
         given: the policy to begin with.
         robot: with the actions of the policy.
         stages: of the command, and its minutes.
+
+    Attributes:
+        evaluation_share: of the minutes left when the bag is read, at most; the rest is learning.
     """
+
+    evaluation_share = EVALUATION_TIME_SHARE
 
     def __init__(self, job: TeachJob, place: Place, graph: Any,
                  given: LoadedCheckpoint | None, robot: RobotSpec, stages: Stages):
@@ -152,8 +179,7 @@ class Teaching:
     def _divide(self) -> None:
         """Divide what is left of the minutes, and say how."""
         read, left = self.stages.seconds, self.stages.left - WRITE_TIME_S
-        config = self._config(left, left)
-        network = self._network(config)
+        network = self._candidate(left)
         network.compute_dtype = torch.float32  # as of a checkpoint that is loaded
         self.stages('what an evaluation costs', 0.0)
         most = min(self.job.episodes, evaluator.ENVIRONMENTS)
@@ -165,7 +191,7 @@ class Teaching:
                       for envs in (few, max(most, few + 1))]
         splits = [name for name, graph in self._graphs().items() if graph is not None]
         self.rows = rows_of(splits, network, self.given.network if self.given else None)
-        self.evaluated = min(EVALUATION_TIME_SHARE * max(left, 0.0), self._plan(math.inf).seconds)
+        self.evaluated = min(self.evaluation_share * max(left, 0.0), self._plan(math.inf).seconds)
         self.learned = max(left - self.evaluated, 0.0)
         chosen = self._plan(self.evaluated)
         if left <= 0:
@@ -225,7 +251,7 @@ class Teaching:
             self.stages.pause()
             info = {key: value for key, value in taught.info.items() if key != 'sha256'}
             info['results'] = self.evaluation.finish() or info['results']
-            if 'arrival' in taught.config.heads:
+            if taught.config.declares:
                 info['stop_threshold'] = threshold
             save_checkpoint(self.folder, taught.network, info)
 
@@ -277,6 +303,10 @@ class Teaching:
     def _pairs(self) -> tuple[PairSource, PairSource]:
         source, judge = self.place.make_pairs(self.own, self.others, self.robot, self.job.seed)
         return Watched(source, lambda: self.stages('picture pairs', 0.0)), judge
+
+    def _candidate(self, seconds: float) -> Policy:
+        """A policy that costs as much as that to be measured, for so many seconds of learning."""
+        return self._network(self._config(seconds, seconds))
 
     def _network(self, config: TrainConfig) -> Policy:
         return network_for_place(config, self.robot, self.graph.pictures.shape[-1],

@@ -1,6 +1,7 @@
 """Checkpoints: a folder with `model.safetensors`, `config.json` and a model card, `README.md`.
 
-Nothing in it is executable: weights are safetensors, everything else is JSON and text.
+One of a policy that searches and was taught a place has `place.safetensors` as well. Nothing in it
+is executable: weights are safetensors, everything else is JSON and text.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from vn_nav.policy.checkpoint_info import (
     CONFIG,
     FORMAT,
     NUMBER,
+    PLACE,
+    PLACE_CHECKSUM,
     WEIGHTS,
     check_info,
     config_checksum,
@@ -35,6 +38,8 @@ from vn_nav.policy.checkpoint_info import (
 from vn_nav.policy.model_card import model_card
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.taught_file import place_bytes, read_place
 from vn_nav.policy.zhu_policy import build_policy
 
 HEADER_BYTES = 1_000_000  # of a safetensors file, without its weights
@@ -56,7 +61,7 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
 
     Args:
         folder: where; its parent is made.
-        network: the policy.
+        network: the policy, with the place that it was taught.
         info: some of the keys of `INFO`.
         half: store weights in 16 bits, half the size.
 
@@ -81,6 +86,11 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
         'sha256': hashlib.sha256(weights).hexdigest(),
         **info,
     }
+    place = network.taught if isinstance(network, SearchPolicy) else None
+    files = {WEIGHTS: weights}
+    if place is not None:
+        files[PLACE] = place_bytes(place)
+        config[PLACE_CHECKSUM] = hashlib.sha256(files[PLACE]).hexdigest()
     del config['network']['actions']  # said once, under action_names
     config['network']['action_filter'] = network.config.filter_name
     try:
@@ -91,8 +101,7 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
     except (TypeError, ValueError) as error:
         raise UserError('info holds only JSON values', str(error), 'convert them first') from error
     parameters = sum(tensor.numel() for tensor in tensors.values())
-    files = {WEIGHTS: weights, CONFIG: text.encode(),
-             CARD: model_card(config, parameters, len(weights)).encode()}
+    files |= {CONFIG: text.encode(), CARD: model_card(config, parameters, len(weights)).encode()}
     try:
         _write_folder(folder, files)
     except OSError as error:
@@ -129,6 +138,12 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
     tensors = _check_weights(weights, shapes, str(folder / WEIGHTS))
     network = build_policy(network_config)
     network.load_state_dict(tensors)
+    if PLACE_CHECKSUM in config:
+        if not isinstance(network, SearchPolicy):
+            raise UserError('a policy that searches alone is taught with key pictures',
+                            f'{where}: architecture {network_config.architecture}, '
+                            f'{PLACE_CHECKSUM}', 'get the checkpoint again')
+        network.taught = read_place(folder, config[PLACE_CHECKSUM], network_config.size)
     return LoadedCheckpoint(network.eval(), network_config, {**info, 'sha256': digest})
 
 
@@ -220,7 +235,7 @@ def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
     """Write a folder that appears, or is replaced, whole or not at all."""
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    if folder.exists() and any(path.name not in (WEIGHTS, CONFIG, CARD)
+    if folder.exists() and any(path.name not in (WEIGHTS, CONFIG, CARD, PLACE)
                                for path in folder.iterdir()):
         raise UserError('only a checkpoint folder is replaced by a checkpoint', str(folder),
                         'choose another folder')

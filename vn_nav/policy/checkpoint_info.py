@@ -14,8 +14,10 @@ from vn_nav.scenes import HOUSE, house_scene
 from vn_nav.structured_file import read_json
 
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
+PLACE = 'place.safetensors'  # of a policy that searches, where it was taught a place
 FORMAT = 2
 OWN = {'format', 'network', 'action_names', 'sha256'}  # keys that are not of INFO
+PLACE_CHECKSUM = 'place_sha256'  # a key that is not of INFO either: of a taught policy alone
 CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
 DECODINGS = ('sample', 'greedy')
 REQUIRED = object()
@@ -97,7 +99,8 @@ def read_config(folder: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise UserError(f'{CONFIG} is as it was written ({CHECKSUM} is the SHA-256 of the rest)',
                         where, 'the file is corrupt: get the checkpoint again; after a change of '
                         f'your own remove {CHECKSUM}')
-    info = {key: value for key, value in config.items() if key not in OWN}
+    info = {key: value for key, value in config.items()
+            if key not in OWN and key != PLACE_CHECKSUM}
     return config, check_info(info, where)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from vn_nav.policy.action_filter import NONE
+from vn_nav.policy.checkpoint_info import PLACE, PLACE_CHECKSUM
 from vn_nav.policy.network_config import SEARCH
 
 
@@ -33,6 +34,8 @@ def model_card(config: dict, parameters: int, size: int) -> str:
         + f'{config["minutes"]:.1f} minutes, seed {config["seed"]}',
         'World version': config['world_version'],
         'Weights': f'SHA-256 `{config["sha256"]}`',
+        **({'Place': f'key pictures and a map in `{PLACE}`, SHA-256 `{config[PLACE_CHECKSUM]}`'}
+           if PLACE_CHECKSUM in config else {}),
     }
     lines = ['# Visual navigation policy', '', _purpose(config, searches), '',
              '| | |', '|---|---|', *(f'| {key} | {value} |' for key, value in facts.items())]
@@ -48,11 +51,13 @@ def model_card(config: dict, parameters: int, size: int) -> str:
 def _purpose(config: dict, searches: bool) -> str:
     """What it does, and what it is given for that."""
     if searches:
+        taught = (' In the place that it was taught it finds out where it is by key pictures, and '
+                  'uses the map of that drive.' if PLACE_CHECKSUM in config else '')
         return ('Drives a robot to the place where a picture was taken: its networks see in each '
                 'picture how far the place is free and where the goal stands; a map of the place, '
                 'drawn along the way from these and from odometry, and a planner on it decide. It '
                 'is given its camera, the goal picture and odometry, or else its own last action; '
-                'no map beforehand, no depth.')
+                f'no {"" if taught else "map beforehand, no "}depth.{taught}')
     purpose = ('Drives a robot to the place where a picture was taken.' if not config['losses']
                else 'Weights to begin a training with (`vn_nav train --init`), pre-trained on '
                'recorded pictures. No episode was driven: whether it arrives is not known.')

@@ -128,6 +128,8 @@ class PolicyRuntime:
     def set_goal(self, goal: np.ndarray) -> None:
         """Take a goal picture, uint8 [3,S,S], encode it once, and begin an episode."""
         self._goal_maps = self._network.encode_goals(self._tensor(goal)[None])
+        if self.search is not None:
+            self.search.prepare(self._goal_maps)
         self.arrival = math.nan
         self.reset()
 

@@ -14,10 +14,16 @@ from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
 from vn_nav.evaluation.metrics import Episode, path_efficiency
 from vn_nav.report.maps import Journey, floor_map
 from vn_nav.report.page import cards, page, picture, table
+from vn_nav.report.search_map import Window, draw, known_bounds
 from vn_nav.report.tables import number
 from vn_nav.scenes import HOUSE, parse_scene
 
 STRIP = 9  # pictures of a film strip
+MAPS, MAP_WIDTH = 4, 520  # of an episode, and pixels
+MAP_LEGEND = """<p class="soft">Below the pictures is the policy's own map as it grew, out of
+camera and odometry: white is free, dark occupied, grey unknown; thin lines show what is really
+there. Green: where it took itself to be. Full arrows: where it took the goal to be, the likeliest
+orange. The blue outline is the goal, of which it knew nothing.</p>"""
 TITLES = {'trained': 'The {kind} it was trained in', 'unseen': 'A {kind} it has never seen'}
 
 
@@ -86,7 +92,10 @@ def _place(place: str, drive: Drive, figures: dict) -> str:
     rows = table(['goal', 'outcome', 'episode', 'start [m]', 'driven [m]', 'SPL', 'decisions',
                   'collisions', 'stop [m]', 'stop [deg]'],
                  [_row(recorded) for recorded in drive.episodes], text=2)
-    journeys = ''.join(_journey(recorded) for recorded in _chosen(drive.episodes))
+    chosen = _chosen(drive.episodes)
+    journeys = ''.join(_journey(recorded, scene) for recorded in chosen)
+    if any(recorded.searches for recorded in chosen):
+        journeys = MAP_LEGEND + journeys
     stop = ' Declared stop.' if stops else ''
     limit = '' if place == 'trained' else (
         f' Episodes end at {figures["max_decisions"]} decisions here.')
@@ -130,7 +139,7 @@ def _chosen(episodes: list[RecordedEpisode], most: int = 4) -> list[RecordedEpis
     return good[:most - min(1, len(bad))] + bad[:1]
 
 
-def _journey(recorded: RecordedEpisode) -> str:
+def _journey(recorded: RecordedEpisode, plan: dict) -> str:
     assert recorded.goal_picture is not None  # see `_chosen`
     e = recorded.episode
     numbers = sorted(recorded.pictures)
@@ -147,7 +156,28 @@ def _journey(recorded: RecordedEpisode) -> str:
 <small>after {e.decisions} decisions, {e.path_length:.1f} m{way}</small></h3>
 <div class="strip">
 <figure class="goal"><img alt="goal picture" src="{picture(recorded.goal_picture)}">
-<figcaption>goal picture</figcaption></figure>{frames}</div></div>"""
+<figcaption>goal picture</figcaption></figure>{frames}</div>{_maps(recorded, plan)}</div>"""
+
+
+def _maps(recorded: RecordedEpisode, plan: dict) -> str:
+    """How the map of a policy that searches grew; '': it is another, or nobody listened."""
+    numbers = sorted(recorded.searches)
+    if not numbers:
+        return ''
+    picked = np.unique(np.linspace(0, len(numbers) - 1, MAPS).round().astype(int))
+    last = recorded.searches[numbers[-1]]
+    bounds = plan['bounds'] if 'bounds' in plan else known_bounds(last.search, last.frame)
+    x0, y0, x1, y1 = bounds
+    view = Window.about(bounds, MAP_WIDTH, round(MAP_WIDTH * (y1 - y0 + 1) / (x1 - x0 + 1)))
+    figures: list[str] = []
+    for count in (numbers[k] for k in picked):
+        known = recorded.searches[count]
+        drawn = draw(known.search, view, known.frame, plan=plan if 'bounds' in plan else None,
+                     goal=recorded.facts['goal_pose'])
+        figures.append(f'<figure><img alt="map" src="{picture(drawn)}"><figcaption>'
+                       f'{"" if figures else "its map at decision "}{count}'
+                       '</figcaption></figure>')
+    return f'<div class="strip grown">{"".join(figures)}</div>'
 
 
 def _map(drive: Drive) -> str:

@@ -47,7 +47,8 @@ figure { margin:18px 0 } svg { width:100%; height:auto; max-height:640px; backgr
   padding:4px 0 } .strip figure { margin:0; flex:none; text-align:center }
 .strip img { width:96px; height:96px; image-rendering:pixelated; border-radius:6px; display:block }
 .strip .goal img { outline:3px solid var(--goal); outline-offset:-3px } .strip figcaption {
-  font-size:.72rem } .journey { border-top:1px solid var(--line); padding:12px 0 }
+  font-size:.72rem } .strip.grown img { width:252px; height:auto; image-rendering:auto }
+.journey { border-top:1px solid var(--line); padding:12px 0 }
 .journey h3 { margin:0 0 6px; font-size:1rem } .yes { color:var(--good) } .no { color:var(--bad) }
 .maps { display:grid; grid-template-columns:repeat(auto-fill, minmax(310px, 1fr)); gap:16px }
 .maps figure { margin:0 } .maps figcaption { font-size:.85rem; padding:4px 2px }

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from vn_nav.policy.search.snapshot import FREE, OCCUPIED, Snapshot
+from vn_nav.policy.search.snapshot import FREE, Snapshot
 from vn_nav.report.maps import MARGIN_M
 from vn_nav.report.page import LIGHT
 
@@ -23,16 +23,18 @@ SHIFT = 4  # fractional bits of cv2's coordinates: lines move by less than a pix
 STRONG = 12.0  # evidence of a hypothesis that is drawn in full size
 SMALLEST = 0.35  # share of it of the weakest
 MOST_GUESSES = 12  # drawn
+OCCUPIED_FROM = 62  # percent: log-odds of 0.5
 
 
-def _rgb(colour: str) -> tuple[int, int, int]:
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Of a colour of pages, '#rrggbb'."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
-UNKNOWN_RGB, FREE_RGB, OCCUPIED_RGB = (203, 207, 213), (255, 255, 255), _rgb(LIGHT['wall'])
+UNKNOWN_RGB, FREE_RGB, OCCUPIED_RGB = (203, 207, 213), (255, 255, 255), rgb(LIGHT['wall'])
 WALL_RGB, THING_RGB = (158, 166, 178), (184, 188, 194)  # outlines of what is really there
-TRACK_RGB, ROBOT_RGB = (120, 190, 160), _rgb(LIGHT['good'])
-GUESS_RGB, BEST_RGB, GOAL_RGB = (240, 176, 140), _rgb(LIGHT['bad']), _rgb(LIGHT['goal'])
+TRACK_RGB, ROBOT_RGB = (120, 190, 160), rgb(LIGHT['good'])
+GUESS_RGB, BEST_RGB, GOAL_RGB = (240, 176, 140), rgb(LIGHT['bad']), rgb(LIGHT['goal'])
 
 
 class Window(NamedTuple):
@@ -102,7 +104,8 @@ def draw(seen: Snapshot, view: Window, frame: np.ndarray, *, plan: Mapping[str, 
     if goal is not None:
         _arrow(image, view, np.array(goal[:3], float), 0.55, GOAL_RGB, filled=False)
     for k, guess in reversed(list(enumerate(seen.guesses[:MOST_GUESSES]))):
-        share = 1.0 if math.isnan(guess.weight) else min(guess.weight / STRONG, 1.0)
+        unknown = math.isnan(guess.weight)  # their order is known all the same
+        share = (0.0 if k else 1.0) if unknown else min(guess.weight / STRONG, 1.0)
         pose = np.array([*placed(frame, guess.pose[None, :2])[0], frame[2] + guess.pose[2]])
         _arrow(image, view, pose, 0.75 * (SMALLEST + (1 - SMALLEST) * math.sqrt(share)),
                BEST_RGB if k == 0 else GUESS_RGB, filled=True)
@@ -113,8 +116,8 @@ def draw(seen: Snapshot, view: Window, frame: np.ndarray, *, plan: Mapping[str, 
 def _cells(seen: Snapshot, view: Window, frame: np.ndarray) -> np.ndarray:
     """The map's cells, turned into the plane of the picture."""
     colours = np.full((*seen.cells.shape, 3), UNKNOWN_RGB, np.uint8)
-    colours[seen.cells == FREE] = FREE_RGB
-    colours[(seen.cells > FREE) & (seen.cells <= OCCUPIED)] = OCCUPIED_RGB
+    colours[seen.cells >= FREE] = FREE_RGB
+    colours[seen.cells >= OCCUPIED_FROM] = OCCUPIED_RGB
     if not seen.cells.size:
         return np.full((view.height, view.width, 3), UNKNOWN_RGB, np.uint8)
     # From a cell's (column, row) to metres in its frame, to metres in the plane, to pixels.

@@ -17,8 +17,9 @@ class Navigation(gymnasium.Env):
     """One robot in one scene, for tools that want a single `gymnasium.Env`.
 
     Observations: `image` and `goal`, both [3,H,W] uint8; with the option `odometry` also that,
-    [3] float64, see `NavigationEnv`. Registered as `vn_nav/Navigation-v0`;
-    `vn_nav/House-v0` is short for that with the scene of a house, by its seed and rooms.
+    [3] float64, with `ranges` also `scan`, [K] float32, see `NavigationEnv`. Registered as
+    `vn_nav/Navigation-v0`; `vn_nav/House-v0` is short for that with the scene of a house, by its
+    seed and rooms.
 
     Args:
         scene: its name.
@@ -38,9 +39,11 @@ class Navigation(gymnasium.Env):
         self._batch = NavigationEnv(EnvConfig(scenes=(scene,), num_envs=1, **options))
         size = self._batch.config.size
         picture = spaces.Box(0, 255, (3, size, size), np.uint8)
-        odometry = {} if self._batch.config.odometry == 'none' else {
-            'odometry': spaces.Box(-np.inf, np.inf, (3,), np.float64)}
-        self.observation_space = spaces.Dict({'image': picture, 'goal': picture, **odometry})
+        batch = self._batch.single_observation_space
+        assert isinstance(batch, spaces.Dict)  # as `NavigationEnv` makes it
+        self._more = [name for name in ('odometry', 'scan') if name in batch.spaces]
+        self.observation_space = spaces.Dict({
+            'image': picture, 'goal': picture, **{name: batch[name] for name in self._more}})
         self.action_space = self._batch.single_action_space
         self._image = np.zeros((3, size, size), np.uint8)
 
@@ -74,7 +77,7 @@ class Navigation(gymnasium.Env):
         self._image = observation['image'][0]
         return {'image': self._image.copy(),
                 'goal': self._batch.goals[observation['goal_index'][0]].copy(),
-                **({'odometry': observation['odometry'][0]} if 'odometry' in observation else {})}
+                **{name: observation[name][0] for name in self._more}}
 
 
 class HouseNavigation(Navigation):

@@ -10,11 +10,16 @@ import numba
 import numpy as np
 
 from vn_nav.policy.search.grid import CELL, OccupancyGrid
+from vn_nav.policy.search.measured import free_of_points
 
 KEEP = 0.04  # m beyond the footprint that is passable: a cell's edge is half a cell off
+SCAN_KEEP = 0.015  # m, the same of what a scan shows exactly
 KEEP_OFF = 0.2  # m beyond the footprint within which a way costs more
 CLOSE_COST = 2.0  # of it: this many metres more for a metre, at the footprint
 UNKNOWN_COST = 2.0  # the same for floor that nobody has seen or measured
+LANE_KEEP = 0.08  # m that what is seen may be nearer, where a robot has driven
+ASIDE_COST = 0.5  # where a robot has driven: for a metre beside that
+WALL_COST = 30.0  # for a wall that is known by hearsay
 ROOM = 0.7  # m about a frontier cell in which the unknown floor counts
 HEAD_START = 1.5  # m that all of it unknown is worth
 LEAST_SHARE = 0.12  # of it that makes a frontier
@@ -50,6 +55,16 @@ class Costmap:
         self.passable = (self.clearance > limit) | grid.been
         close = np.clip((limit + KEEP_OFF - self.clearance) / KEEP_OFF, 0, 1)
         price = 1 + CLOSE_COST * close + UNKNOWN_COST * self.uncharted
+        heard = grid.heard_of()
+        if heard is not None:
+            # Where a robot has driven is the surest way, surer than what this one sees. Where it
+            # has only seen floor is none: there may be a wall that its eyes missed. Its walls lie
+            # a little off, and would close doors: they cost, and block nothing.
+            lane, wall, floor = heard
+            # Obstacles as near to it as a robot can pass may be seen a little off.
+            lane = lane & (self.clearance > grid.footprint - LANE_KEEP)
+            self.passable |= lane
+            price = np.where(lane, 1, price + ASIDE_COST + UNKNOWN_COST * floor + WALL_COST * wall)
         self.cost = np.where(self.passable, price, 0).astype(np.float32)
 
     def frontiers(self) -> tuple[np.ndarray, np.ndarray]:
@@ -83,8 +98,22 @@ class Costmap:
         Args:
             pose: [3] where it begins; angle: of the line on the map [rad]; length: m.
         """
-        return free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
-                           float(pose[1]), angle, length)
+        got, clear = free_length(self.passable, self.clearance, self.grid.origin, float(pose[0]),
+                                 float(pose[1]), angle, length)
+        exact, room = self.scanned_length(pose, angle, length)
+        return min(got, exact), min(clear, room)
+
+    def scanned_length(self, pose: np.ndarray, angle: float, length: float
+                       ) -> tuple[float, float]:
+        """As `free_length`, by the newest scan alone, which is finer than cells.
+
+        Returns:
+            The whole length and infinity where a picture came since.
+        """
+        if self.grid.points is None:
+            return length, math.inf
+        return free_of_points(self.grid.points, float(pose[0]), float(pose[1]), angle, length,
+                              self.grid.footprint + SCAN_KEEP)
 
 
 @numba.njit(cache=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,9 +11,11 @@ from torch import Tensor
 
 from vn_nav.measured_ranges import Scan, laser_scan
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
-from vn_nav.policy.search.lens import bearings_through, in_metres
+from vn_nav.policy.search.key_pictures import KeyPictures, Mode
+from vn_nav.policy.search.lens import SAME, bearings_through, in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.recall import Recall
 from vn_nav.policy.search.searcher import Rules, Searcher, Sight
 
 
@@ -26,6 +29,7 @@ class SearchDriver:
 
     Attributes:
         searchers: [N], with map and hypotheses of each robot.
+        recalls: [N], what each recalls of the place that the network was taught; None: of none.
         arrival: [N] float32 probability that the robots have arrived, at the newest pictures.
     """
 
@@ -35,6 +39,11 @@ class SearchDriver:
         self._bearings = bearings = column_bearings(config.view)
         self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint, rules)
                           for _ in range(num_envs)]
+        place = network.taught
+        self._keys = None if place is None else KeyPictures(network, place)
+        self.recalls = None if place is None or self._keys is None else [
+            Recall(place, self._keys) for _ in range(num_envs)]
+        self._goal: tuple[Tensor, list[Mode]] | None = None
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self._before: np.ndarray | None = None
         self._compile(Searcher(config.moves, bearings, RANGE_EDGES, config.footprint))
@@ -48,6 +57,16 @@ class SearchDriver:
             for action in (-1, int(np.argmax(searcher.moves[:, 0]))):  # the second meets something
                 searcher.step(sight, action, np.zeros(3))
             searcher.step(sight, -1, np.zeros(3), scan=laser_scan(np.ones(4), 0.0, 1.0, 0.1, 2.0))
+
+    def prepare(self, goal_maps: Tensor) -> None:
+        """Look for a goal [1,...] in the taught place now, so that the first `act` need not."""
+        if self._keys is not None:
+            self._goal = goal_maps, self._keys.poses_of_goal(goal_maps)
+
+    def _poses_of_goal(self, keys: KeyPictures, goal_maps: Tensor) -> list[Mode]:
+        if self._goal is not None and goal_maps.equal(self._goal[0]):
+            return self._goal[1]
+        return keys.poses_of_goal(goal_maps)
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
@@ -67,7 +86,8 @@ class SearchDriver:
         Raises:
             FloatingPointError: what the networks say is not finite.
         """
-        look = self.network.look(torch.from_numpy(image), goal_maps)
+        pictures = torch.from_numpy(image)
+        look = self.network.look(pictures, goal_maps)
         if not all(torch.isfinite(part).all() for part in look):
             raise FloatingPointError('what the policy sees is not finite')
         sights = sights_of(in_metres(look, self._bearings, zoom))
@@ -80,11 +100,19 @@ class SearchDriver:
         for n, (searcher, sight) in enumerate(zip(self.searchers, sights, strict=True)):
             if starts[n]:
                 searcher.reset()
+            recall = None
+            # Through another lens the key pictures look different.
+            if self.recalls is not None and self._keys is not None and (
+                    abs(zoom / self.recalls[n].place.zoom[0] - 1) < SAME):
+                own = self.recalls[n]
+                if starts[n]:
+                    own.begin(self._poses_of_goal(self._keys, goal_maps[n:n + 1]))
+                recall = functools.partial(own.look, image=pictures[n:n + 1])
             searcher.bearings = bearings
             actions[n] = searcher.step(sight, -1 if starts[n] else int(last_action[n]),
                                        None if odometry is None else odometry[n],
                                        unmoved=bool(still[n]) and not starts[n],
-                                       scan=None if scans is None else scans[n])
+                                       scan=None if scans is None else scans[n], recall=recall)
             self.arrival[n] = searcher.arrival
         return actions
 

@@ -8,12 +8,14 @@ along. Kernels run in NumPy's memory, compiled; torch is not needed.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from vn_nav.measured_ranges import Scan
-from vn_nav.policy.search.measured import enter_scan, look_over
+from vn_nav.policy.search.measured import ends_of, enter_scan, look_over
 
 CELL = 0.1  # m
 SIDE = 320  # cells
@@ -30,11 +32,20 @@ MISSES = 3  # looks that should have shown a cell by the map, and did not: it is
 VIEW = 2.5  # m to which a look is expected to show floor
 
 
+class Prior(NamedTuple):
+    """What somebody knows of the cells of a map, [SIDE,SIDE] float32 each."""
+
+    log_odds: np.ndarray
+    seen: np.ndarray
+    lane: np.ndarray  # 1: a robot's centre was here
+
+
 class OccupancyGrid:
     """The map of one robot.
 
     Args:
         footprint: radius of the robot [m].
+        side: cells; middle: [2] m, of the map.
 
     Attributes:
         log_odds: [SIDE,SIDE] float32, rows along y.
@@ -43,19 +54,25 @@ class OccupancyGrid:
         missed: [SIDE,SIDE] int16: looks that should have shown it, by the map, and did not.
         stood: [SIDE,SIDE] bool: the robot was on it; been: its centre was.
         contacts: [SIDE,SIDE] bool: it met something here.
+        prior: of somebody who knows the place, for cells that the robot has not seen itself; None:
+            nobody, or the map has moved.
         origin: [2] m, of the lower left corner.
+        points: [K,2] m where the rays of the newest scan end; None: a picture came since.
     """
 
-    def __init__(self, footprint: float):
+    def __init__(self, footprint: float, side: int = SIDE, middle: Sequence[float] = (0.0, 0.0)):
         self.footprint = footprint
-        self.log_odds = np.zeros((SIDE, SIDE), np.float32)
-        self.seen = np.zeros((SIDE, SIDE), np.float32)
-        self.measured = np.zeros((SIDE, SIDE), bool)
-        self.missed = np.zeros((SIDE, SIDE), np.int16)
-        self.stood = np.zeros((SIDE, SIDE), bool)
-        self.been = np.zeros((SIDE, SIDE), bool)
-        self.contacts = np.zeros((SIDE, SIDE), bool)
-        self.origin = np.array([-CELL * SIDE / 2, -CELL * SIDE / 2])
+        self.log_odds = np.zeros((side, side), np.float32)
+        self.seen = np.zeros((side, side), np.float32)
+        self.measured = np.zeros((side, side), bool)
+        self.missed = np.zeros((side, side), np.int16)
+        self.stood = np.zeros((side, side), bool)
+        self.been = np.zeros((side, side), bool)
+        self.contacts = np.zeros((side, side), bool)
+        self.origin = np.asarray(middle, float) - CELL * side / 2
+        self.points: np.ndarray | None = None
+        self.prior: Prior | None = None
+        self._prior_counts = True
 
     def add_ranges(self, pose: np.ndarray, bearings: np.ndarray, ranges: np.ndarray,
                    edges: np.ndarray) -> None:
@@ -69,6 +86,7 @@ class OccupancyGrid:
                 one farther than the last.
         """
         self._follow(pose)
+        self.points = None
         spread = np.abs(np.gradient(bearings)).mean()
         _integrate(self.log_odds, self.seen, self.origin, np.asarray(pose, float),
                    np.asarray(bearings, float), float(spread), np.asarray(ranges, float),
@@ -93,6 +111,7 @@ class OccupancyGrid:
         enter_scan(self.log_odds, self.measured, self.origin, CELL, at, scanner.bearings,
                    scan.ranges.astype(float), scanner.nearest, scanner.clear_from,
                    min(scanner.farthest, SCAN_REACH), FREE_WEIGHT, HIT_WEIGHT, MOST)
+        self.points = ends_of(scan, at, SCAN_REACH)
         angles = pose[2] + np.asarray(bearings, float)
         look_over(self.seen, self.measured, self.obstacles(), self.origin, CELL, pose[0], pose[1],
                   angles, REACH, SUB_RAYS)
@@ -113,9 +132,10 @@ class OccupancyGrid:
                                  pose[1], heading + bearings, False) for heading in headings])
 
     def forget_looks(self) -> None:
-        """Let everything be looked at again; obstacles and free floor stay."""
+        """Let everything be looked at again; own obstacles and free floor stay, no prior."""
         self.seen *= 0.2
         self.missed[:] = 0
+        self._prior_counts = False
 
     def known_area(self) -> float:
         """Floor that was seen [m^2]."""
@@ -124,7 +144,7 @@ class OccupancyGrid:
     def give_up(self, cell: tuple[int, int], radius: float) -> None:
         """Let nothing within a radius [m] of a cell be looked for any more."""
         x, y = self.origin + CELL * (np.array(cell[::-1]) + 0.5)
-        done = np.zeros((SIDE, SIDE), bool)
+        done = np.zeros(self.seen.shape, bool)
         _disc(done, self.origin, x, y, radius, True)
         self.missed[done] = MISSES
 
@@ -147,7 +167,22 @@ class OccupancyGrid:
 
     def unknown(self) -> np.ndarray:
         """[SIDE,SIDE] bool: hardly seen."""
-        return (self.seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
+        seen = self.seen
+        if self.prior is not None and self._prior_counts:
+            seen = seen + self.prior.seen
+        return (seen < KNOWN) & (self.missed < MISSES) & ~self.stood & ~self.contacts
+
+    def heard_of(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """What the prior says, [SIDE,SIDE] bool: where a robot drove, walls, floor that was seen.
+
+        The last two where this robot has seen nothing itself. None: there is no prior.
+        """
+        if self.prior is None or not self._prior_counts:
+            return None
+        lane = (self.prior.lane > 0.5) & (self.log_odds <= OCCUPIED) & ~self.contacts
+        other = (self.seen < KNOWN) & ~self.stood & ~self.contacts & (self.log_odds <= OCCUPIED)
+        wall = other & ~lane & (self.prior.log_odds > OCCUPIED)
+        return lane, wall, other & ~lane & ~wall & (self.prior.seen >= KNOWN)
 
     def occupancy(self) -> np.ndarray:
         """[SIDE,SIDE] int8: percent of an obstacle, -1: nothing is known."""
@@ -163,23 +198,26 @@ class OccupancyGrid:
     def cell(self, x: float, y: float) -> tuple[int, int]:
         """Row and column of a place; outside, of the nearest cell."""
         column, row = ((np.array([x, y]) - self.origin) / CELL).astype(int)
-        return int(np.clip(row, 0, SIDE - 1)), int(np.clip(column, 0, SIDE - 1))
+        side = len(self.seen)
+        return int(np.clip(row, 0, side - 1)), int(np.clip(column, 0, side - 1))
 
     def _follow(self, pose: np.ndarray) -> None:
         """Move the map where the robot comes near its edge; what falls off is forgotten."""
+        side = len(self.seen)
         column, row = np.floor((np.asarray(pose[:2]) - self.origin) / CELL).astype(int)
-        if MARGIN <= row < SIDE - MARGIN and MARGIN <= column < SIDE - MARGIN:
+        if MARGIN <= row < side - MARGIN and MARGIN <= column < side - MARGIN:
             return
-        shift = np.array([column, row]) - SIDE // 2
+        shift = np.array([column, row]) - side // 2
         for name in ('log_odds', 'seen', 'measured', 'missed', 'stood', 'been', 'contacts'):
             old = getattr(self, name)
             new = np.zeros_like(old)
-            rows, columns = (np.arange(SIDE) + s for s in shift[::-1])
-            inside = np.ix_((rows >= 0) & (rows < SIDE), (columns >= 0) & (columns < SIDE))
-            new[inside] = old[np.ix_(rows[(rows >= 0) & (rows < SIDE)],
-                                     columns[(columns >= 0) & (columns < SIDE)])]
+            rows, columns = (np.arange(side) + s for s in shift[::-1])
+            inside = np.ix_((rows >= 0) & (rows < side), (columns >= 0) & (columns < side))
+            new[inside] = old[np.ix_(rows[(rows >= 0) & (rows < side)],
+                                     columns[(columns >= 0) & (columns < side)])]
             setattr(self, name, new)
         self.origin = self.origin + CELL * shift
+        self.prior = None
 
 
 def on_robot(pose: np.ndarray, mount: tuple[float, float, float]) -> np.ndarray:

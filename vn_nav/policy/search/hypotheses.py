@@ -91,6 +91,19 @@ class Hypotheses:
                        co_visible / max(sigma, 0.15) ** 2)
         self.all = [own for own in self.all if own.weight > FORGET]
 
+    def suggest(self, pose: np.ndarray, weight: float, precision: float) -> Hypothesis:
+        """Take in a pose [3] that no look, but somebody who knows the place, says.
+
+        Returns:
+            The hypothesis: a new one, or one that looks have made there.
+        """
+        near = self._near(pose)
+        if near is None:
+            self.all.append(Hypothesis(np.array(pose, float), weight, precision))
+            return self.all[-1]
+        near.weight = min(near.weight + weight, WEIGHT_MOST)
+        return near
+
     def refute(self, own: Hypothesis) -> None:
         """The robot stood there, and it was not the goal; or it did not get there."""
         own.refuted += 1
@@ -110,13 +123,17 @@ class Hypotheses:
         """The one with most evidence."""
         return max(self.all, key=lambda own: own.weight, default=None)
 
-    def _vote(self, pose: np.ndarray, weight: float, precision: float) -> None:
+    def _near(self, pose: np.ndarray) -> Hypothesis | None:
+        """The one with most evidence of those that a vote for a pose is for."""
         near = [own for own in self.all
                 if apart(own.pose, pose)[0] < MERGE_M and apart(own.pose, pose)[1] < MERGE_RAD]
-        if not near:
+        return max(near, key=lambda own: own.weight, default=None)
+
+    def _vote(self, pose: np.ndarray, weight: float, precision: float) -> None:
+        own = self._near(pose)
+        if own is None:
             self.all.append(Hypothesis(pose, weight, precision))
             return
-        own = max(near, key=lambda own: own.weight)
         # The newest look counts at least a fifth: odometry drifts, and near looks are better.
         gain = max(precision / (own.precision + precision), 0.2)
         own.pose[:2] += gain * (pose[:2] - own.pose[:2])

@@ -65,18 +65,29 @@ def in_metres(look: Look, bearings: np.ndarray, zoom: float) -> Look:
     """
     if abs(zoom - 1) < SAME:
         return look
-    cosine, sine = look.heading[:, 0], look.heading[:, 1] / zoom
-    length = torch.sqrt(cosine.square() + sine.square()).clamp(min=1e-6)
-    heading = torch.stack([cosine, sine], 1) / length[:, None]
-    # d(true) / d(squeezed) of the angle; the spread grows to that of the worse axis.
-    heading_sigma = look.heading_sigma / zoom / length.square()
-    position = look.position * torch.tensor([zoom, 1.0])
-    sigma = look.position_sigma * max(zoom, 1.0)
+    position, sigma, heading, heading_sigma = pose_in_metres(
+        look.position, look.position_sigma, look.heading, look.heading_sigma, zoom)
     arrived = arrival_by_pose(position, sigma, heading, heading_sigma) * torch.sigmoid(
         look.co_visible)
     stretch = zoom * np.cos(bearings) / np.cos(bearings_through(bearings, zoom))
     return Look(_shifted(look.ranges, torch.from_numpy(np.log(stretch)).float()), position, sigma,
                 heading, heading_sigma, look.co_visible, torch.logit(arrived, 1e-6))
+
+
+def pose_in_metres(position: Tensor, sigma: Tensor, heading: Tensor, heading_sigma: Tensor,
+                   zoom: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The same of the place as it is: position [N,2], its spread [N], heading [N,2], its [N].
+
+    Args:
+        position, sigma, heading, heading_sigma: see `Look`, as the networks say.
+        zoom: of the lens.
+    """
+    cosine, sine = heading[:, 0], heading[:, 1] / zoom
+    length = torch.sqrt(cosine.square() + sine.square()).clamp(min=1e-6)
+    # d(true) / d(squeezed) of the angle; the spread grows to that of the worse axis.
+    return (position * torch.tensor([zoom, 1.0]), sigma * max(zoom, 1.0),
+            torch.stack([cosine, sine], 1) / length[:, None],
+            heading_sigma / zoom / length.square())
 
 
 def _shifted(log_probabilities: Tensor, logs: Tensor) -> Tensor:

@@ -11,6 +11,8 @@ import math
 import numba
 import numpy as np
 
+from vn_nav.measured_ranges import Scan
+
 
 @numba.njit(cache=True)
 def enter_scan(log_odds, measured, origin, cell, at, bearings, ranges, nearest, clear_from, reach,
@@ -61,6 +63,44 @@ def enter_scan(log_odds, measured, origin, cell, at, bearings, ranges, nearest, 
             measured[row, column] = True
             change = hit if mark[row, column] == 3 else -free if mark[row, column] == 2 else 0.0
             log_odds[row, column] = min(max(log_odds[row, column] + change, -most), most)
+
+
+def ends_of(scan: Scan, at: np.ndarray, reach: float) -> np.ndarray:
+    """Where the rays of a scan end within a reach, on the map: [K,2] m.
+
+    Args:
+        at: [3] pose of the scanner on the map; reach: m.
+    """
+    ranges = np.maximum(scan.ranges, scan.scanner.nearest)  # minus infinity: nearer than that
+    known = ranges <= reach
+    angles = at[2] + scan.scanner.bearings[known]
+    return at[:2] + ranges[known, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
+
+
+@numba.njit(cache=True)
+def free_of_points(points, x, y, angle, length, radius):
+    """How far [m] a disc gets on a straight line without a point in it, and the clearance [m].
+
+    What it leaves behind does not count.
+
+    Args:
+        points: [K,2] m; x, y: m where it begins; angle: rad; length: m.
+        radius: of the disc [m].
+    """
+    dx, dy = math.cos(angle), math.sin(angle)
+    got = length
+    for i in range(len(points)):
+        px, py = points[i, 0] - x, points[i, 1] - y
+        along, across = dx * px + dy * py, dx * py - dy * px
+        if along > 0.0 and abs(across) < radius:
+            got = min(got, max(along - math.sqrt(radius**2 - across**2), 0.0))
+    clear = math.inf
+    for i in range(len(points)):
+        px, py = points[i, 0] - x, points[i, 1] - y
+        along, across = dx * px + dy * py, dx * py - dy * px
+        if along > 0.0:
+            clear = min(clear, math.hypot(max(along - got, 0.0), across))
+    return got, clear
 
 
 @numba.njit(cache=True)

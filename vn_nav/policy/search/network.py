@@ -20,6 +20,7 @@ from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Latents, Policy, PolicyOutput
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.search.look import BINS, COLUMNS, Look
+from vn_nav.policy.search.taught import TaughtPlace
 
 LOG_SCALES = -3.5, 2.0  # of the position, log of metres: 0.03 to 7.4 m
 LOG_CONCENTRATIONS = -3.0, 6.0  # of the heading: from all but uniform to 3 degrees
@@ -105,6 +106,9 @@ class SearchPolicy(Policy):
 
     It has no memory, actor or critic: `forward` is refused. `encoder` compares picture and goal,
     `recogniser` reads the comparison, `ranges` sees the picture alone.
+
+    Attributes:
+        taught: the place that it knows, of a recorded drive; None: none.
     """
 
     uses_odometry = True
@@ -112,6 +116,7 @@ class SearchPolicy(Policy):
 
     def _build(self, config: NetworkConfig) -> None:
         pixels = config.pixel_mean, config.pixel_std
+        self.taught: TaughtPlace | None = None
         self.tracker = self.places = self.routes = self.around = None
         self.encoder = Matching(config.size, config.channels, config.features, config.blocks,
                                 *pixels)

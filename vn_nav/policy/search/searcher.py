@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from vn_nav.policy.search.approach import best_move
 from vn_nav.policy.search.costmap import ROOM, Costmap
 from vn_nav.policy.search.grid import OccupancyGrid
 from vn_nav.policy.search.hypotheses import MISS_BELOW, Hypotheses, Hypothesis, apart
+from vn_nav.policy.search.lookahead import ENOUGH, best_turns, cost_at
 
 # Decisions of exploring that show less new floor than this: where it leads there is none.
 IDLE, IDLE_M2 = 12, 0.5
@@ -87,6 +88,7 @@ class Searcher:
         self._right = int(np.argmin(np.where(still, self.moves[:, 2], np.inf)))
         self._turn = float(self.moves[self._left, 2])
         self._drives = np.flatnonzero(~still)
+        self._ahead = int(np.argmax(self.moves[:, 0]))
         self.reset()
 
     def reset(self) -> None:
@@ -106,7 +108,8 @@ class Searcher:
         self._decisions, self._forgot, self._stuck_for = 0, -FORGET_EVERY, 0
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
-             unmoved: bool = False, scan: Scan | None = None) -> int:
+             unmoved: bool = False, scan: Scan | None = None,
+             recall: Callable[[Searcher], None] | None = None) -> int:
         """The next action.
 
         Args:
@@ -116,6 +119,7 @@ class Searcher:
             unmoved: without odometry: the picture is as before the action.
             scan: measured where the picture was taken: the map takes it in place of the ranges
                 that are seen.
+            recall: brings to mind what is known of the place; called before the decision.
         """
         self._move(last_action, odometry, unmoved)
         self.grid.add_footprint(self.pose)
@@ -126,6 +130,8 @@ class Searcher:
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
         self.arrival, self.seen = sight.arrived, sight
+        if recall is not None:
+            recall(self)
         action = self._decide()
         self._last = action
         return action
@@ -237,6 +243,7 @@ class Searcher:
         still = np.hypot(self.moves[:, 0], self.moves[:, 1]) < 1e-6
         is_open = np.array([bool(s) or not self._is_blocked(angle)
                             for s, angle in zip(still, ways, strict=True)])
+        is_open &= self._cut_off(costmap, ways, np.hypot(*self.moves[:, :2].T)) <= 0
         is_open &= ~self._cannot_turn(self.moves[:, 2])
         move, worth = best_move(costmap.passable, costmap.clearance, self.grid.origin, self.pose,
                                 own.pose, self.moves, self.rules.decision_price, is_open)
@@ -297,36 +304,44 @@ class Searcher:
         return True
 
     def _drive(self, field: np.ndarray, costmap: Costmap) -> int | None:
-        """The first action of turns and a move that lead on best; None: none does."""
-        rules = self.rules
-        most = math.ceil(math.pi / self._turn)
-        best, chosen = np.inf, None
+        """The first action of turns and moves that lead on best; None: none does."""
+        rules, most = self.rules, math.ceil(math.pi / self._turn)
         counts = np.arange(-most, most + 1)
-        for k in sorted(counts[~self._cannot_turn(counts)].tolist(), key=abs):
-            yaw = self.pose[2] + k * self._turn
-            for action in self._drives:
-                dx, dy, _ = self.moves[action]
-                length, angle = math.hypot(dx, dy), yaw + math.atan2(dy, dx)
-                if self._is_blocked(angle):
-                    continue
-                got, clear = costmap.free_length(self.pose, angle, length)
-                end = self.pose[:2] + got * np.array([math.cos(angle), math.sin(angle)])
-                cost = (self._at(field, end) + got + rules.turn_cost * abs(k)
-                        + rules.contact_cost * (length - got)
-                        + rules.graze_cost * max(1 - (clear - self.footprint) / rules.graze_m, 0)
-                        + (rules.backward_cost if dx <= 0 else 0.0)
-                        + (rules.back_cost if self._turns_back(np.array([k]))[0] else 0.0))
-                if got > 0.45 * length and cost < best:
-                    best = cost
-                    chosen = action if k == 0 else self._left if k > 0 else self._right
-        return None if chosen is None or not np.isfinite(best) else int(chosen)
+        headings = self.pose[2] + counts * self._turn
+        more = np.where(self._turns_back(counts), rules.back_cost, 0.0)
+        more[[self._is_blocked(angle) for angle in headings]] = np.inf
+        more[self._cannot_turn(counts)] = np.inf
+        step = float(np.hypot(*self.moves[self._ahead, :2]))
+        off = self._cut_off(costmap, headings, np.full(len(headings), step))
+        more += np.where(off < (1 - ENOUGH) * step, rules.contact_cost * off, np.inf)
+        prices = np.array([rules.turn_cost, rules.contact_cost, rules.graze_cost, rules.graze_m,
+                           self.footprint])
+        turns, best = best_turns(
+            costmap.passable, costmap.clearance, field, self.grid.origin, self.pose, self._turn,
+            step, most, more, prices)
+        chosen = self._ahead if turns == 0 else self._left if turns > 0 else self._right
+        for action in self._drives:
+            if action == self._ahead:
+                continue
+            dx, dy, _ = self.moves[action]
+            length, angle = math.hypot(dx, dy), self.pose[2] + math.atan2(dy, dx)
+            if self._is_blocked(angle):
+                continue
+            got, clear = costmap.free_length(self.pose, angle, length)
+            if got <= 0.45 * length:
+                continue
+            end = self.pose[:2] + got * np.array([math.cos(angle), math.sin(angle)])
+            cost = (cost_at(field, self.grid.origin, end[0], end[1]) + got
+                    + rules.contact_cost * (length - got) + rules.backward_cost
+                    + rules.graze_cost * max(1 - (clear - self.footprint) / rules.graze_m, 0))
+            if cost < best:
+                best, chosen = cost, int(action)
+        return int(chosen) if np.isfinite(best) else None
 
-    def _at(self, field: np.ndarray, place: np.ndarray) -> float:
-        """A field's value at a place: of the best cell about it."""
-        row, column = self.grid.cell(*place)
-        part = field[max(row - 1, 0):row + 2, max(column - 1, 0):column + 2]
-        return float(field[row, column]) if np.isfinite(field[row, column]) else float(
-            part.min()) + 0.15
+    def _cut_off(self, costmap: Costmap, angles: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        """Metres [K] by which a scan shows something in the way of straight lines from here."""
+        return np.array([length - costmap.scanned_length(self.pose, angle, length)[0]
+                         for angle, length in zip(angles, lengths, strict=True)])
 
     def _is_blocked(self, angle: float) -> bool:
         """Whether a move in this direction [rad] met something about here before."""

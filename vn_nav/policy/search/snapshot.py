@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vn_nav.policy.search.grid import CELL, KNOWN
+from vn_nav.policy.search.grid import CELL
 from vn_nav.policy.search.searcher import Searcher
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # cells of a snapshot, as of nav_msgs/OccupancyGrid
@@ -22,7 +22,7 @@ class Guess(NamedTuple):
 class Snapshot(NamedTuple):
     """A search at a moment, in the frame of its map."""
 
-    cells: np.ndarray  # [R,C] int8 of `UNKNOWN`, `FREE`, `OCCUPIED`, rows along y
+    cells: np.ndarray  # [R,C] int8, `FREE` to `OCCUPIED` in percent, or `UNKNOWN`; rows along y
     origin: np.ndarray  # [2] m, of the lower left corner of the first cell
     cell: float  # m
     pose: np.ndarray  # [3] x, y [m], yaw [rad] of the robot
@@ -34,15 +34,25 @@ class Snapshot(NamedTuple):
 def snapshot(searcher: Searcher) -> Snapshot:
     """What a searcher knows now; a copy, cut to the known part of its map."""
     grid = searcher.grid
-    obstacles = grid.obstacles()
-    known = (grid.seen >= KNOWN) | grid.stood | obstacles
-    cells = np.where(obstacles, OCCUPIED, np.where(known, FREE, UNKNOWN)).astype(np.int8)
-    rows, columns = (_range(known.any(axis)) for axis in (1, 0))
+    # What it keeps off, also where it has hardly looked.
+    cells = np.where(grid.obstacles(), np.int8(OCCUPIED), grid.occupancy())
+    cells, origin = cut_to_known(cells, grid.origin, CELL)
     guesses = sorted(searcher.hypotheses.all, key=lambda own: -own.weight)
     return Snapshot(
-        cells[rows, columns].copy(), grid.origin + CELL * np.array([columns.start, rows.start]),
-        CELL, searcher.pose.copy(), tuple(Guess(own.pose.copy(), own.weight) for own in guesses),
-        searcher.aim, float(searcher.arrival))
+        cells, origin, CELL, searcher.pose.copy(),
+        tuple(Guess(own.pose.copy(), own.weight) for own in guesses), searcher.aim,
+        float(searcher.arrival))
+
+
+def cut_to_known(cells: np.ndarray, origin: np.ndarray, cell: float
+                 ) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a map that is known, a copy, and its origin [2] m.
+
+    Args:
+        cells: [R,C] as of `Snapshot`; origin: [2] m of theirs; cell: m.
+    """
+    rows, columns = (_range((cells != UNKNOWN).any(axis)) for axis in (1, 0))
+    return cells[rows, columns].copy(), origin + cell * np.array([columns.start, rows.start])
 
 
 def _range(known: np.ndarray) -> slice:
