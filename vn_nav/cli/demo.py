@@ -43,7 +43,7 @@ from vn_sim_bridge.simulators import simulator_class
 if TYPE_CHECKING:
     from vn_nav.nodes.demo_watch import EndedEpisode
 
-ONE_HOUSE, ANY_HOUSE = 'models/house', 'models/anywhere'  # the shipped policies
+ONE_HOUSE, ANY_HOUSE = 'models/house', 'models/search'  # the shipped policies
 LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode; the second for a policy of one house
 UNSEEN_HOUSE = 11_000  # seed, of the split test: no shipped policy has seen it
 SEED = 2026  # of starts, goals and light
@@ -75,7 +75,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         'first one of the training, and of a policy of houses an unseen house')
     parser.add_argument('--episodes', type=int, default=20,
                         help='in the trained scene, or in that of --scene')
-    parser.add_argument('--unseen-episodes', type=int, default=10, help='in an unseen house')
+    parser.add_argument('--unseen-episodes', type=int, default=20, help='in an unseen house')
     parser.add_argument('--checkpoint', type=Path, help='instead of the shipped policies: of '
                         'one house in that house, of any house elsewhere')
 
