@@ -21,8 +21,8 @@ from photographs import Pairs, judge, look, print_table
 
 from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
+from vn_nav.lens import zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint
-from vn_nav.policy.search.lens import zoom_of
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.resources import share_file
 from vn_nav.scenes import house_scenes

@@ -47,8 +47,9 @@ from vn_nav.learning.sight_figures import (
     angle_between,
     auc,
 )
+from vn_nav.lens import zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint
-from vn_nav.policy.search.lens import in_metres, zoom_of
+from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, Look, column_bearings
 from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
 from vn_nav.resources import share_file

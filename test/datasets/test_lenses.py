@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from vn_nav.lens import squeezed_pose, zoom_of
 from vn_nav.observation import OUTSIDE_GREY
-from vn_nav.policy.search.lens import squeezed_pose, zoom_of
 from vn_nav.policy.search.look import column_bearings
 from vn_nav.robot import RobotSpec
 from vn_nav.scenes import house_scenes

@@ -7,16 +7,11 @@ import pytest
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.lens import bearings_through, squeezed_pose, squeezed_ranges, zoom_of
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime
-from vn_nav.policy.search.lens import (
-    bearings_through,
-    in_metres,
-    squeezed_pose,
-    squeezed_ranges,
-    zoom_of,
-)
+from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.look import (
     BINS,
     COLUMNS,

@@ -154,8 +154,7 @@ def _topics(path: Path | None):
 def _camera(checkpoint: Path | None, robot: Path | None) -> tuple[float | None, bool]:
     """What the camera has to see [rad], and whether less will do; None: nobody has said."""
     if checkpoint is not None:
-        from vn_nav.policy.checkpoint_info import read_config
-        from vn_nav.policy.network_config import SEARCH
+        from vn_nav.policy.checkpoint_info import SEARCH, read_config
         whole, info = read_config(checkpoint)
         return (math.radians(info['camera_fov_deg']),
                 whole['network'].get('architecture') == SEARCH)

@@ -9,11 +9,11 @@ import numpy as np
 
 from vn_nav.errors import UserError
 from vn_nav.evaluation.metrics import Episode, summarise
+from vn_nav.lens import zoom_of
 from vn_nav.observation import preprocess
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.runtime import BatchedPolicy
-from vn_nav.policy.search.lens import zoom_of
 from vn_nav.policy.search.snapshot import Snapshot, snapshot
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec

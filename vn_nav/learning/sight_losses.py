@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from vn_nav.learning.auxiliary import POSE_OVERLAP
 from vn_nav.learning.returns import masked_mean
-from vn_nav.policy.search.lens import SAME
+from vn_nav.lens import SAME
 from vn_nav.policy.search.look import range_classes
 from vn_nav.policy.search.network import Recognition, SearchPolicy
 

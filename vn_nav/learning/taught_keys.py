@@ -11,8 +11,9 @@ import torch
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
+from vn_nav.lens import bearings_through
 from vn_nav.policy.search.grid import CELL, MARGIN, MOST, OccupancyGrid
-from vn_nav.policy.search.lens import bearings_through, in_metres
+from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.look import RANGE_EDGES, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.taught import MOST_SIDE, TaughtPlace

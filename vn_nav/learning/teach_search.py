@@ -12,10 +12,10 @@ import numpy as np
 
 from vn_nav.learning.taught_keys import choose_keys, recall_drive
 from vn_nav.learning.teaching import Teaching
+from vn_nav.lens import zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.search.grid import CELL, KNOWN
-from vn_nav.policy.search.lens import zoom_of
 from vn_nav.policy.search.network import SearchPolicy
 
 

@@ -13,6 +13,7 @@ from vn_nav.errors import UserError
 from vn_nav.scenes import HOUSE, house_scene
 from vn_nav.structured_file import read_json
 
+SEARCH = 'search'  # the architecture of `vn_nav.policy.search`
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
 PLACE = 'place.safetensors'  # of a policy that searches, where it was taught a place
 FORMAT = 2

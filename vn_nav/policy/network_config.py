@@ -8,9 +8,9 @@ import math
 from vn_nav.errors import UserError
 from vn_nav.labels import CLASSES, MAX_CLASSES
 from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
+from vn_nav.policy.checkpoint_info import SEARCH
 from vn_nav.policy.zhu import FROZEN
 
-SEARCH = 'search'  # the architecture of `vn_nav.policy.search`
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017', SEARCH)
 # Channels that each image head draws, and the width of its inner maps. The thesis says that depth
 # has "only" 32, so the segmentation heads are wider.

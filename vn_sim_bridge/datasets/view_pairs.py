@@ -10,12 +10,7 @@ import numpy as np
 
 from vn_nav.co_visibility import co_visible, lift, relative_pose
 from vn_nav.errors import UserError
-from vn_nav.policy.search.lens import (
-    bearings_through,
-    squeezed_pose,
-    squeezed_ranges,
-    zoom_of,
-)
+from vn_nav.lens import bearings_through, squeezed_pose, squeezed_ranges, zoom_of
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.counter_random import Stream, key, uniform
 from vn_sim_bridge.datasets.lenses import Lenses, cut

@@ -41,6 +41,8 @@ class Costmap:
         unknown: [SIDE,SIDE] bool: nobody has looked there; uncharted: [SIDE,SIDE] bool: nor has
             anybody measured.
         cost: [SIDE,SIDE] float32 of a metre; 0 where it is not passable.
+        metre: [SIDE,SIDE] float32, what a metre of a straight piece costs `lookahead`: in a taught
+            place as `cost`, for the ways of the drive; else 1, which did better.
     """
 
     def __init__(self, grid: OccupancyGrid, off: float = 0.0, felt: bool = True):
@@ -66,6 +68,7 @@ class Costmap:
             self.passable |= lane
             price = np.where(lane, 1, price + ASIDE_COST + UNKNOWN_COST * floor + WALL_COST * wall)
         self.cost = np.where(self.passable, price, 0).astype(np.float32)
+        self.metre = np.ones_like(self.cost) if heard is None else self.cost
 
     def frontiers(self) -> tuple[np.ndarray, np.ndarray]:
         """Cells [K,2] from which more floor shows, and their head start [K] in metres."""

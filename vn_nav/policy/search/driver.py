@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vn_nav.lens import SAME, bearings_through
 from vn_nav.measured_ranges import Scan, laser_scan
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
-from vn_nav.policy.search.lens import SAME, bearings_through, in_metres
+from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.recall import Recall

@@ -1,9 +1,7 @@
 """Lenses narrower, or wider, than the one that the networks of `search` know.
 
-A picture through a lens that magnifies `zoom` times shows a point (forward x, left y) where the
-known lens would show one at (x / zoom, y): the place as if it were squeezed in depth. The networks
-speak of that squeezed place, whatever the lens; here it is turned into metres and back. Turned
-cameras fit that picture only nearly: the networks learn it through many lenses.
+The networks speak of the squeezed place of `vn_nav.lens`, whatever the lens, and learn it through
+many lenses; here it is turned into metres.
 """
 
 from __future__ import annotations
@@ -14,43 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vn_nav.lens import SAME, bearings_through
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, arrival_by_pose
 
-SAME = 0.05  # a zoom off 1 by less is none
 _LOG_STEP = math.log(RANGE_EDGES[1] / RANGE_EDGES[0])
-
-
-def zoom_of(fov: float, known: float) -> float:
-    """How many times a lens magnifies against the known one, of fields of view [rad]."""
-    return math.tan(known / 2) / math.tan(fov / 2)
-
-
-def squeezed_pose(goal_pose: np.ndarray, zoom: np.ndarray) -> np.ndarray:
-    """Poses [K,4] as of `vn_nav.co_visibility.relative_pose`, as the networks see them.
-
-    Args:
-        goal_pose: [K,4] x, y [m], cosine, sine; zoom: [K].
-    """
-    squeezed = np.array(goal_pose, np.float32)
-    squeezed[:, 0] /= zoom
-    squeezed[:, 3] *= zoom
-    squeezed[:, 2:] /= np.hypot(squeezed[:, 2], squeezed[:, 3])[:, None]
-    return squeezed
-
-
-def bearings_through(bearings: np.ndarray, zoom: np.ndarray | float) -> np.ndarray:
-    """True bearings of the picture columns that have these bearings [rad] in the known lens."""
-    return np.arctan(np.tan(bearings) / zoom)
-
-
-def squeezed_ranges(ranges: np.ndarray, bearings: np.ndarray, zoom: np.ndarray) -> np.ndarray:
-    """Ranges [V,C] m along `bearings_through`, as the networks see them.
-
-    Args:
-        ranges: [V,C] m; bearings: [C] rad of the columns in the known lens; zoom: [V].
-    """
-    true = bearings_through(bearings, zoom[:, None])
-    return (ranges * np.cos(true) / zoom[:, None] / np.cos(bearings)).astype(np.float32)
 
 
 def in_metres(look: Look, bearings: np.ndarray, zoom: float) -> Look:

@@ -23,11 +23,13 @@ ENOUGH = 0.45  # share of a first step that is free, at least
 
 
 @numba.njit(cache=True)
-def best_turns(passable, clearance, field, origin, pose, turn, length, most, open_turns, prices):
+def best_turns(passable, clearance, metre, field, origin, pose, turn, length, most, open_turns,
+               prices):
     """Turns, to the left where positive, before the best first step ahead, and its price [m].
 
     Args:
-        passable, clearance: [S,S] of a costmap; field: [S,S] m to go; origin: [2] m.
+        passable, clearance, metre: [S,S] of a costmap, the last one what a metre costs.
+        field: [S,S] m to go; origin: [2] m.
         pose: [3] x, y [m], yaw [rad].
         turn: rad of one turn; length: m of one step ahead.
         most: turns either way, at most.
@@ -49,7 +51,8 @@ def best_turns(passable, clearance, field, origin, pose, turn, length, most, ope
             got, clear = free_length(passable, clearance, origin, x, y, yaw, length)
             if got < length and (step > 0 or got <= ENOUGH * length):
                 break
-            cost += got + prices[1] * (length - got) + _graze(clear, prices)
+            cost += (_price(metre, origin, x, y, yaw, got) + prices[1] * (length - got)
+                     + _graze(clear, prices))
             x += got * math.cos(yaw)
             y += got * math.sin(yaw)
             total = cost + _left(field, origin, x, y, yaw, turn, prices[0])
@@ -66,13 +69,27 @@ def best_turns(passable, clearance, field, origin, pose, turn, length, most, ope
                     got, clear = free_length(passable, clearance, origin, u, v, on, length)
                     if got < length:
                         break
-                    more += got + _graze(clear, prices)
+                    more += _price(metre, origin, u, v, on, got) + _graze(clear, prices)
                     u += got * math.cos(on)
                     v += got * math.sin(on)
                     total = more + _left(field, origin, u, v, on, turn, prices[0])
                     if total < best:
                         best, chosen = total, k
     return chosen, best
+
+
+@numba.njit(cache=True)
+def _price(metre, origin, x, y, angle, length):
+    """Of a straight piece, by what a metre costs there; 1 where the map names no price."""
+    total, side = 0.0, metre.shape[0]
+    count = max(int(math.ceil(length / CELL)), 1)
+    for k in range(count):
+        r = length * (k + 0.5) / count
+        column = int(math.floor((x + r * math.cos(angle) - origin[0]) / CELL))
+        row = int(math.floor((y + r * math.sin(angle) - origin[1]) / CELL))
+        known = 0 <= row < side and 0 <= column < side
+        total += max(metre[row, column], 1.0) if known else 1.0
+    return total * length / count
 
 
 @numba.njit(cache=True)

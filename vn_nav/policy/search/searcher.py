@@ -317,8 +317,8 @@ class Searcher:
         prices = np.array([rules.turn_cost, rules.contact_cost, rules.graze_cost, rules.graze_m,
                            self.footprint])
         turns, best = best_turns(
-            costmap.passable, costmap.clearance, field, self.grid.origin, self.pose, self._turn,
-            step, most, more, prices)
+            costmap.passable, costmap.clearance, costmap.metre, field, self.grid.origin, self.pose,
+            self._turn, step, most, more, prices)
         chosen = self._ahead if turns == 0 else self._left if turns > 0 else self._right
         for action in self._drives:
             if action == self._ahead:
