@@ -14,8 +14,8 @@ PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 # The leaves that the simulator may use, and what its node shares with the other nodes.
 LEAVES = {'vn_nav.arrival', 'vn_nav.errors', 'vn_nav.goal_picture', 'vn_nav.observation',
           'vn_nav.co_visibility', 'vn_nav.labels', 'vn_nav.lens',
-          'vn_nav.measured_ranges', 'vn_nav.reset_arguments', 'vn_nav.resources', 'vn_nav.robot', 'vn_nav.scenes',
-          'vn_nav.structured_file'}
+          'vn_nav.measured_ranges', 'vn_nav.reset_arguments', 'vn_nav.resources',
+          'vn_nav.robot', 'vn_nav.scenes', 'vn_nav.structured_file'}
 NODE_SHARED = {'vn_nav.nodes.parameters', 'vn_nav.nodes.policy_parameters',
                'vn_nav.nodes.process', 'vn_nav.nodes.qos'}
 
