@@ -249,7 +249,7 @@ def result_and_rows(stop_threshold=0.0, scenes=('house:7', 'house:8')):
                    episodes=8, controls=('wrong goal', 'random actions'), threshold=stop_threshold)
     return {'checkpoint': 'a <b> run', 'simulator': 'house', 'world_version': '2', 'task': 'image',
             'decoding': 'sample', 'max_decisions': 40, 'seed': 0, 'odometry': 'drift',
-            'camera': '90 deg, 1 m high',
+            'ranges': 'picture', 'camera': '90 deg, 1 m high',
             'date': '2026-11-24', 'splits': {'scenes': split_figures(rows, scenes)}
             }, {'scenes': rows}
 

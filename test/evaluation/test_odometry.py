@@ -50,7 +50,7 @@ def measured(folder, tmp_path, *options):
 def test_evaluate_names_the_odometry_that_the_policy_got(folder, tmp_path, using, options, kind):
     result, page = measured(folder, tmp_path, *options)
     assert result['odometry'] == kind
-    assert f'odometry:\n{kind}, ranges: picture.' in page
+    assert f'odometry:\n{kind}, ranges: picture,' in page
     assert using and all(('odometry' in seen) == (kind != 'none') for seen in using)
     if kind != 'none':
         assert not using[0]['odometry'].any() and any(s['odometry'].any() for s in using)
@@ -58,7 +58,7 @@ def test_evaluate_names_the_odometry_that_the_policy_got(folder, tmp_path, using
 
 def test_other_policies_get_none_and_take_none(folder, tmp_path):
     result, page = measured(folder, tmp_path)
-    assert result['odometry'] == 'none' and 'odometry:\nnone, ranges: picture.' in page
+    assert result['odometry'] == 'none' and 'odometry:\nnone, ranges: picture,' in page
     network = load_checkpoint(folder).network
     assert network.uses_odometry is False and odometry_for(network, 'none') == 'none'
     with pytest.raises(UserError, match='leave it out'):
@@ -69,7 +69,7 @@ def test_other_policies_get_none_and_take_none(folder, tmp_path):
 def test_evaluate_names_the_ranges_that_the_map_got(tmp_path, capsys, kind):
     searching = share_file('models/search')
     result, page = measured(searching, tmp_path, '--house', '7', '--ranges', kind)
-    assert result['ranges'] == kind and f'ranges: {kind}.' in page
+    assert result['ranges'] == kind and f'ranges: {kind},' in page
     assert f'ranges: {kind}' in ' '.join(capsys.readouterr().out.split())
 
 

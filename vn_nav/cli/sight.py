@@ -57,7 +57,8 @@ def run(args: argparse.Namespace, config: TrainConfig) -> int:
     with contextlib.ExitStack() as open_now:
         print(f'opens {len(scenes)} scenes to learn from, and {len(others)} others to judge by',
               flush=True)
-        source = PairSampler(scenes, seed=args.seed, lenses=Lenses(), **options)
+        many = args.cameras == 'many'
+        source = PairSampler(scenes, seed=args.seed, lenses=Lenses() if many else None, **options)
         open_now.callback(source.simulator.close)
         validation = PairSampler(others, seed=args.seed + 1, **options)
         open_now.callback(validation.simulator.close)
@@ -71,6 +72,7 @@ def run(args: argparse.Namespace, config: TrainConfig) -> int:
         network.compute_dtype = (fast_dtype() if config.bf16 is None else
                                  torch.bfloat16 if config.bf16 else torch.float32)
         numbers = SightConfig(
+            augment=many,
             pairs=config.frames, minutes=config.minutes, learning_rate=config.learning_rate,
             final_learning_rate=config.final_learning_rate,
             max_gradient_norm=config.max_gradient_norm,

@@ -87,6 +87,9 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--cache', type=Path, metavar='DIR',
                         help='with --bags: of decoded bags; default: OUT/decoded')
     parser.add_argument('--houses', type=int, metavar='N', help='the first N training houses')
+    parser.add_argument('--cameras', choices=('own', 'many'), default='own',
+                        help="of the preset search: the robot's own camera, or other lenses, "
+                        'formats, heights and pitches too, and changed pictures')
     parser.add_argument('--goals-per-room', type=int, default=1)
     parser.add_argument('--goal-variants', type=int,
                         help="differently lit pictures of each goal; default: the randomisation's")
@@ -159,6 +162,10 @@ def run(args: argparse.Namespace) -> int:
     if config.architecture == SEARCH:
         from vn_nav.cli import sight
         return sight.run(args, config)
+    if args.cameras != 'own':
+        raise UserError('other cameras are drawn for picture pairs of the preset search',
+                        f'--cameras {args.cameras} with the preset {args.preset}',
+                        'leave it out, or use --preset search')
     _check(args)
     if args.env == 'ros':
         return _over_ros(args)

@@ -54,7 +54,7 @@ class SightConfig:
 
     pairs: int = 40_000_000
     minutes: float | None = None  # wall-clock, drawing included
-    augment: bool = True  # pictures to learn from, see `vn_nav.learning.augmentation`
+    augment: bool = False  # pictures to learn from, see `vn_nav.learning.augmentation`
     groups: int = 64  # of a goal and a robot each, in a step: two pairs each
     learning_rate: float = 8e-4  # at the start
     final_learning_rate: float = 2e-5  # falls linearly to it
