@@ -98,7 +98,7 @@ def test_the_film_strip_counts_decisions():
     recorded, = drive.episodes
     count = recorded.episode.decisions
     assert list(recorded.pictures) == list(range(1, count + 1))
-    page = report._journey(recorded)
+    page = report._journey(recorded, {})
     assert f'after {count} decisions' in page
     captions = [int(n) for n in re.findall(r'<figcaption>(?:decision )?(\d+)</figcaption>', page)]
     assert captions[0] == 1 and captions[-1] == count and len(captions) == report.STRIP

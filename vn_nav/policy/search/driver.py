@@ -12,6 +12,7 @@ from torch import Tensor
 from vn_nav.lens import SAME, bearings_through
 from vn_nav.measured_ranges import Scan, laser_scan
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
+from vn_nav.policy.search.costmap import Costmap
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
 from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
@@ -52,12 +53,15 @@ class SearchDriver:
     @staticmethod
     def _compile(searcher: Searcher) -> None:
         """Decide a little: else the first decision on a robot would be seconds late."""
-        for co_visible in (0.0, 0.99):
+        # A goal that is nowhere, far and near: it explores, follows a guess, approaches it.
+        for co_visible, away in ((0.0, 1.0), (0.99, 2.5), (0.99, 1.0)):
+            searcher.reset()
             sight = Sight(np.eye(BINS, dtype=np.float32)[np.full(COLUMNS, BINS - 8)],
-                          np.array([1.0, 0.0]), 0.3, np.array([1.0, 0.0]), co_visible, 0.0)
+                          np.array([away, 0.0]), 0.3, np.array([1.0, 0.0]), co_visible, 0.0)
             for action in (-1, int(np.argmax(searcher.moves[:, 0]))):  # the second meets something
                 searcher.step(sight, action, np.zeros(3))
             searcher.step(sight, -1, np.zeros(3), scan=laser_scan(np.ones(4), 0.0, 1.0, 0.1, 2.0))
+        Costmap(searcher.grid).free_length(searcher.pose, 0.0, 0.5)  # of moves aside and back
 
     def prepare(self, goal_maps: Tensor) -> None:
         """Look for a goal [1,...] in the taught place now, so that the first `act` need not."""
