@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def demonstrate(out: Path, folder: Path | None = None, *, episodes: int = 20,
-                unseen_episodes: int = 10, scene: str | None = None) -> int:
+                unseen_episodes: int = 20, scene: str | None = None) -> int:
     """Drive, record, measure, report.
 
     A checkpoint with a stop threshold has to declare its stop; for others arriving is enough.
