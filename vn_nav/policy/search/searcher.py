@@ -328,7 +328,7 @@ class Searcher:
             if self._is_blocked(angle):
                 continue
             got, clear = costmap.free_length(self.pose, angle, length)
-            if got <= 0.45 * length:
+            if got <= ENOUGH * length:
                 continue
             end = self.pose[:2] + got * np.array([math.cos(angle), math.sin(angle)])
             cost = (cost_at(field, self.grid.origin, end[0], end[1]) + got
