@@ -329,13 +329,16 @@ def test_continuous_mode_decides_in_motion():
     assert velocity[0] > 0.05
 
 
-def test_a_stop_that_is_cleared_at_once_still_sends_its_zeros(rig):
+@pytest.mark.parametrize('heard', [0, 1, 5])
+def test_a_stop_that_is_cleared_at_once_still_sends_its_zeros(rig, heard):
+    """Whether or not the output thread was asked between the two."""
     rig.arm()
     while not rig.step().any():
         rig.decide()
     rig.navigator.stop('~/stop was called', rig.now)
-    rig.navigator.reset()  # before the output thread was asked
-    sent = [rig.step() for _ in range(int(1.5 / DT))]
+    sent = [rig.step() for _ in range(heard)]
+    rig.navigator.reset()
+    sent += [rig.step() for _ in range(int(1.5 / DT))]
     zeros = [velocity for velocity in sent if velocity is not None]
     assert len(zeros) >= 0.9 / DT and not np.any(zeros)
     rig.navigator.stop('again', rig.now)

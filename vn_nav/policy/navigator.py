@@ -207,9 +207,10 @@ class Navigator:
 
     def _idle(self, reason: str) -> None:
         self._abandon()
-        if self.state in ENABLED or (
-                self.state is State.STOPPED and self._stopped_from is None):
+        if self.state in ENABLED:
             self._idle_from = None  # a command may be in force: the next step takes it back
+        elif self.state is State.STOPPED:
+            self._idle_from = self._stopped_from  # its second of zeros goes on
         self.state, self.reason, self.arrival = State.IDLE, reason, None
 
     def _abandon(self) -> None:
