@@ -112,7 +112,7 @@ def cameras_of(sequence: Sequence) -> dict[str, tuple[Camera, bool]]:
 def look(network: SearchPolicy, images: np.ndarray, pairs: Pairs, zoom: float) -> Look:
     """What the network says of pairs, in metres; of ranges nothing."""
     pictures = torch.from_numpy(images)
-    goals = network.encode_goals(pictures)
+    goals = network.encoder.encode_goals(pictures, network.compute_dtype)
     seen = network.encoder.see(pictures, network.compute_dtype)
     parts = []
     for begin in range(0, len(pairs.first), BATCH):

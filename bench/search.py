@@ -18,6 +18,9 @@ processes (`--rows`). Prints a Markdown table, ready for docs/results.md.
   **low**, **high**, **narrow**, **wide**: cameras 0.4 and 1.4 m high, fields of view of 70 and 110
   degrees (`bench/robots`), of a policy that was trained with another. All in the houses of
   `--split`, declared stop alone.
+- **one_look**, **no_refuting**, **no_looking**, **no_squeezing**: a part taken away. **truth**,
+  **truth_scan**: where the goal is comes from the simulator, not from the picture; with the scan
+  nothing that is seen decides any more. Declared stop alone.
 """
 
 from __future__ import annotations
@@ -27,11 +30,14 @@ import dataclasses
 import datetime
 import hashlib
 import json
+import math
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from vn_nav.cli.scenes import split_scenes
 from vn_nav.cli.world import load_for, machine, make_env_for
@@ -45,13 +51,18 @@ from vn_nav.evaluation.measurement import (
     ranges_for,
 )
 from vn_nav.files import write_file
+from vn_nav.learning.auxiliary import POSE_OVERLAP
 from vn_nav.policy import search
 from vn_nav.policy.checkpoint import LoadedCheckpoint
+from vn_nav.policy.search.look import Look
+from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.rules import Rules
 from vn_nav.report import tables
 from vn_nav.report.tables import number
 from vn_nav.robot import load_robot
 from vn_nav.scenes import rooms_of
 
+TRUE_SIGMA, SURE = 0.05, 8.0  # m and rad; logit
 ROBOTS = Path(__file__).resolve().parent / 'robots'
 SEARCH = Path(search.__file__).parent  # what decides is no part of a checkpoint
 
@@ -68,6 +79,8 @@ class Row:
     odometry: str | None = None
     robot: str | None = None  # a file of `ROBOTS`
     ranges: str | None = None
+    rules: Rules | None = None  # None: the usual ones
+    truth: bool = False  # recognition is the simulator's
 
 
 ROWS = {
@@ -92,6 +105,12 @@ ROWS = {
     'high': Row('camera 1.4 m high', robot='high'),
     'narrow': Row('field of view 70 deg', robot='narrow'),
     'wide': Row('field of view 110 deg', robot='wide'),
+    'one_look': Row('evidence of the newest look alone', rules=Rules(gathers=False)),
+    'no_refuting': Row('no evidence is lost', rules=Rules(refutes=False)),
+    'no_looking': Row('no turns to look', rules=Rules(look_from=math.inf)),
+    'no_squeezing': Row('a stuck robot goes on as before', rules=Rules(unsticks=False)),
+    'truth': Row('true recognition', truth=True),
+    'truth_scan': Row('true recognition, map by a LaserScan', truth=True, ranges='scan'),
 }
 
 
@@ -108,7 +127,8 @@ def conditions(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespa
             'randomisation': row.randomisation or info['randomisation'],
             'odometry': odometry_for(checkpoint.network, row.odometry),
             'ranges': ranges_for(checkpoint.network, row.ranges),
-            'camera': row.robot or 'as trained', 'control': row.control}
+            'camera': row.robot or 'as trained', 'control': row.control,
+            'rules': None if row.rules is None else repr(row.rules), 'truth': row.truth}
 
 
 def finished(path: Path, wanted: dict) -> dict | None:
@@ -133,19 +153,56 @@ def measured(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespace
                           rooms_of(info['scenes'][0]) if info['scenes'] else None)
 
     def make(names, environments: int, stop: str):
-        return make_env_for(checkpoint, names, environments, stop=stop, robot=robot, own=False,
-                            randomisation=row.randomisation, odometry=row.odometry,
-                            max_decisions=options.max_decisions, ranges=row.ranges)
+        env = make_env_for(checkpoint, names, environments, stop=stop, robot=robot, own=False,
+                           randomisation=row.randomisation, odometry=row.odometry,
+                           max_decisions=options.max_decisions, ranges=row.ranges,
+                           privileged=('overlap',) if row.truth else ())
+        if row.truth:
+            tell_truth(checkpoint.network, env)
+        return env
     if robot:
         load_for(options.checkpoint, robot, any_camera=True)  # it has the policy's actions
-    rows = measure_checkpoint(checkpoint, scenes, make, EvaluateConfig(
-        episodes=options.episodes, seed=options.seed, stops=row.stops, policy=row.control is None,
-        controls=() if row.control is None else (row.control,),
-        stop_threshold=options.stop_threshold, robot=load_robot(robot) if robot else None))
+    checkpoint.network.rules = row.rules
+    try:
+        rows = measure_checkpoint(checkpoint, scenes, make, EvaluateConfig(
+            episodes=options.episodes, seed=options.seed, stops=row.stops,
+            policy=row.control is None, controls=() if row.control is None else (row.control,),
+            stop_threshold=options.stop_threshold, robot=load_robot(robot) if robot else None))
+    finally:
+        vars(checkpoint.network).pop('look', None)
     return {'figures': {stop: next(iter(own.values()))
                         for stop, own in evaluator.figures(rows).items() if own},
             'minutes': round((time.monotonic() - begun) / 60, 1), 'machine': machine(),
             'date': datetime.date.today().isoformat()}
+
+
+def tell_truth(network: SearchPolicy, env) -> None:
+    """Let a network see the ranges, and have the simulator say where the goal is."""
+    told: dict = {}
+
+    def remember(function):
+        def remembered(*args, **options):
+            found = function(*args, **options)
+            told.update(found[-1])
+            return found
+        return remembered
+
+    def look(image: Tensor, goal_maps: Tensor, goal_index: Tensor | None = None) -> Look:
+        robots, goals = told['pose'], env.goal_poses[told['goal']]
+        position = (goals[:, :2] - robots[:, :2]).T
+        c, s = np.cos(robots[:, 2]), np.sin(robots[:, 2])
+        turn = goals[:, 2] - robots[:, 2]
+        sees, there = told['overlap'] >= POSE_OVERLAP, told['arrived']
+        return SearchPolicy.look(network, image, goal_maps, goal_index)._replace(**{
+            name: torch.from_numpy(np.asarray(value, np.float32)) for name, value in {
+                'position': np.stack([c * position[0] + s * position[1],
+                                      c * position[1] - s * position[0]], axis=1),
+                'position_sigma': np.full(len(robots), TRUE_SIGMA),
+                'heading': np.stack([np.cos(turn), np.sin(turn)], axis=1),
+                'heading_sigma': np.full(len(robots), TRUE_SIGMA),
+                'co_visible': np.where(sees, SURE, -SURE),
+                'arrived': np.where(there, SURE, -SURE)}.items()})
+    env.reset, env.step, network.look = remember(env.reset), remember(env.step), look
 
 
 def markdown(found: dict[str, dict]) -> str:

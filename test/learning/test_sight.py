@@ -242,7 +242,8 @@ def test_it_begins_with_what_matching_has_learned(tmp_path):
     image = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, 3, 40, 40), np.uint8))
     with torch.inference_mode():
         pose = given.heads['goal_pose'](given.encode(image, given.encode_goals(image), None)[1])
-        look = policy.look(image, policy.encode_goals(image))
+        goals = policy.encoder.encode_goals(image, torch.float32)
+        look = policy.recogniser(policy.encode(image, goals, None)[1])
     assert torch.allclose(look.position, pose.position, atol=1e-5)
     assert torch.allclose(look.co_visible, pose.co_visible, atol=1e-5)
     assert torch.allclose(look.heading, torch.nn.functional.normalize(pose.heading), atol=1e-5)

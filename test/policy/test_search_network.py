@@ -28,7 +28,12 @@ from vn_nav.policy.search.look import (
     median_ranges,
     range_classes,
 )
-from vn_nav.policy.search.network import SearchPolicy, heading_deviation
+from vn_nav.policy.search.network import (
+    Recognition,
+    SearchPolicy,
+    agreed,
+    heading_deviation,
+)
 from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import RobotSpec
 
@@ -74,6 +79,32 @@ def test_a_goal_belongs_to_its_picture_and_ranges_to_no_goal():
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(look, same, strict=True))
     assert torch.equal(look.ranges, other.ranges)
     assert not torch.allclose(look.position, other.position, atol=1e-4)
+
+
+def test_a_mirrored_look_is_the_look_mirrored():
+    policy = network()
+    image, goals = pictures(3), pictures(3, seed=1)
+    with torch.inference_mode():
+        look = policy.look(image, policy.encode_goals(goals))
+        other = policy.look(image.flip(-1), policy.encode_goals(goals.flip(-1)))
+    sides = torch.tensor([1.0, -1.0])
+    back = other._replace(ranges=other.ranges.flip(1), position=sides * other.position,
+                          heading=sides * other.heading)
+    assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(look, back, strict=True))
+
+
+def test_of_two_opinions_the_surer_one_counts_more():
+    sure, unsure = (Recognition(
+        torch.tensor([[x, 0.0]]), torch.tensor([scale]), torch.tensor([heading]),
+        torch.tensor([kappa]), torch.tensor([logit]), torch.tensor([logit]))
+        for x, scale, heading, kappa, logit in (
+            (1.0, math.log(0.1), [1.0, 0.0], math.log(9.0), 2.0),
+            (2.0, math.log(0.3), [0.0, 1.0], 0.0, 4.0)))
+    both = agreed(sure, unsure)
+    assert torch.allclose(both.position, torch.tensor([[1.1, 0.0]]))  # 9 : 1
+    assert torch.allclose(both.heading[:, 1] / both.heading[:, 0], torch.tensor([1 / 9]))
+    assert both.co_visible.item() == both.arrived.item() == 3.0
+    assert all(torch.allclose(a, b) for a, b in zip(both, agreed(unsure, sure), strict=True))
 
 
 def test_columns_stay_apart():

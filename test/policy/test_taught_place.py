@@ -307,7 +307,7 @@ def test_parts_that_do_not_fit_are_no_place(change):
 def test_a_runtime_recalls_and_prepares_its_goal(tmp_path):
     save_checkpoint(tmp_path / 'model', taught(), INFO)
     policy = PolicyRuntime(tmp_path / 'model')
-    (goal, other), image = pictures(2, 5), pictures(1, 6)[0]
+    (goal, other), image = pictures(2, 12), pictures(1, 6)[0]
     policy.set_goal(goal)
     assert policy.search is not None and policy.search.recalls is not None
     first = [policy.act(image, np.zeros(3)) for _ in range(3)]

@@ -91,7 +91,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
                  max_decisions: int = 300, goal_seed: int = 0, odometry: str | None = None,
                  size: int | None = None,
-                 ranges: str | None = None,
+                 ranges: str | None = None, privileged: Collection[str] = (),
                  say: Callable[[str], None] = SAY):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
 
@@ -106,6 +106,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         odometry: that the policy is given; None: see `measurement.odometry_for`.
         size: side of the pictures [pixels]; None: what the policy needs.
         ranges: that its map is given; None: see `measurement.ranges_for`.
+        privileged: what it tells beside the observations, to who measures.
         say: receives a line about what the simulator cannot vary.
 
     Raises:
@@ -127,7 +128,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,
                    goals_per_room=info['goals_per_room'] if own else 1,
                    odometry=odometry_for(checkpoint.network, odometry),
-                   ranges=ranges_for(checkpoint.network, ranges),
+                   ranges=ranges_for(checkpoint.network, ranges), privileged=tuple(privileged),
                    may_lack=() if randomisation else ('randomisation',), say=say)
     try:
         check_version(info, simulator=env.simulator_name, version=env.world_version)

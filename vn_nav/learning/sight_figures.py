@@ -12,7 +12,13 @@ from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.learning.auxiliary import POSE_OVERLAP
 from vn_nav.learning.sight_losses import WEIGHTS, range_loss, recognise, recognition_losses
 from vn_nav.policy.search.look import arrival_by_pose, median_ranges
-from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
+from vn_nav.policy.search.network import (
+    PER_AXIS,
+    SearchPolicy,
+    agreed,
+    heading_deviation,
+    mirrored,
+)
 
 BATCH = 128  # views
 # The hard ring: nearly there, or there but askew.
@@ -63,7 +69,10 @@ class Judged(NamedTuple):
 
 @torch.no_grad()
 def judge(network: SearchPolicy, batch: dict[str, np.ndarray]) -> Judged:
-    """What a network says of pairs, in float32; a view belongs to pairs of its group alone."""
+    """What a network says of pairs, in float32; a view belongs to pairs of its group alone.
+
+    As on a robot: of the pictures and of their mirror images together.
+    """
     before, network.compute_dtype = network.compute_dtype, torch.float32
     said, ranges = [], []
     image, first, second = (batch[name] for name in ('image', 'first', 'second'))
@@ -72,8 +81,10 @@ def judge(network: SearchPolicy, batch: dict[str, np.ndarray]) -> Judged:
     for begin in range(0, len(image), step):
         views = torch.from_numpy(image[begin:begin + step])
         own = (first >= begin) & (first < begin + step)
-        said.append(recognise(network, views, first[own] - begin, second[own] - begin))
-        ranges.append(network.ranges(views, torch.float32))
+        pairs = first[own] - begin, second[own] - begin
+        said.append(agreed(recognise(network, views, *pairs),
+                           mirrored(recognise(network, views.flip(-1), *pairs))))
+        ranges.append(network.see_ranges(views))
     network.compute_dtype = before
     seen = type(said[0])(*(torch.cat(parts) for parts in zip(*said, strict=True)))
     log_ranges = torch.cat(ranges)

@@ -35,7 +35,7 @@ def losses(network: SearchPolicy, batch: dict[str, np.ndarray]) -> dict[str, Ten
 def recognise(network: SearchPolicy, image: Tensor, first: np.ndarray, second: np.ndarray
               ) -> Recognition:
     """What is said of pairs [K] of views [V,3,S,S]; the second is the goal. Each is seen once."""
-    goals = network.encode_goals(image)
+    goals = network.encoder.encode_goals(image, network.compute_dtype)
     seen = network.encoder.see(image, network.compute_dtype)
     own, other = torch.from_numpy(first), torch.from_numpy(second)
     return network.recogniser(network.encoder.meet(

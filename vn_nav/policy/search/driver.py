@@ -18,7 +18,7 @@ from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.recall import Recall
-from vn_nav.policy.search.searcher import Rules, Searcher, Sight
+from vn_nav.policy.search.searcher import Searcher, Sight
 
 
 class SearchDriver:
@@ -27,7 +27,6 @@ class SearchDriver:
     Args:
         network: what sees.
         num_envs: robots, N.
-        rules: of the decisions; None: the usual ones.
 
     Attributes:
         searchers: [N], with map and hypotheses of each robot.
@@ -35,11 +34,12 @@ class SearchDriver:
         arrival: [N] float32 probability that the robots have arrived, at the newest pictures.
     """
 
-    def __init__(self, network: SearchPolicy, num_envs: int, rules: Rules | None = None):
+    def __init__(self, network: SearchPolicy, num_envs: int):
         config = network.config
         self.network = network
         self._bearings = bearings = column_bearings(config.view)
-        self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint, rules)
+        self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint,
+                                   network.rules)
                           for _ in range(num_envs)]
         place = network.taught
         self._keys = None if place is None else KeyPictures(network, place)

@@ -66,9 +66,14 @@ def on_map(pose: np.ndarray, position: np.ndarray, heading: np.ndarray) -> np.nd
 
 
 class Hypotheses:
-    """All poses that the goal may have, for one robot."""
+    """All poses that the goal may have, for one robot.
 
-    def __init__(self):
+    Args:
+        gathers, refutes: see `vn_nav.policy.search.searcher.Rules`.
+    """
+
+    def __init__(self, gathers: bool = True, refutes: bool = True):
+        self._gathers, self._refutes = gathers, refutes
         self.all: list[Hypothesis] = []
 
     def look(self, pose: np.ndarray, position: np.ndarray, sigma: float, heading: np.ndarray,
@@ -80,7 +85,7 @@ class Hypotheses:
             position, heading: [2] of the goal in the robot's frame; sigma: m of the position.
             co_visible: probability that the picture shows some of what the goal shows.
         """
-        for own in self.all:
+        for own in self.all if self._refutes else ():
             gap, turn = apart(pose, own.pose)
             if gap < MISS_M and turn < MISS_RAD and co_visible < MISS_BELOW:
                 own.weight *= 0.5
@@ -106,6 +111,8 @@ class Hypotheses:
 
     def refute(self, own: Hypothesis) -> None:
         """The robot stood there, and it was not the goal; or it did not get there."""
+        if not self._refutes:
+            return
         own.refuted += 1
         own.weight *= 0.25 if own.likeliest > LIKELY else 0.02
         own.likeliest = 0.0
@@ -130,6 +137,8 @@ class Hypotheses:
         return max(near, key=lambda own: own.weight, default=None)
 
     def _vote(self, pose: np.ndarray, weight: float, precision: float) -> None:
+        if not self._gathers:
+            self.all.clear()
         own = self._near(pose)
         if own is None:
             self.all.append(Hypothesis(pose, weight, precision))

@@ -78,10 +78,9 @@ class KeyPictures:
         self.network, self.poses = network, place.poses.astype(float)
         self._zoom = float(place.zoom[0])
         pictures = torch.from_numpy(place.pictures)
-        self._seen = torch.cat([network.encoder.see(part, network.compute_dtype)
-                                for part in pictures.split(64)])
+        self._seen = torch.cat([network.see(part) for part in pictures.split(64)])
         self._maps = torch.cat([network.encode_goals(part) for part in pictures.split(64)])
-        self._pooled = _pooled(self._maps).flatten(0, 1)
+        self._pooled = _pooled(self._maps[:, 0]).flatten(0, 1)
 
     @torch.inference_mode()
     def poses_of_goal(self, goal_maps: Tensor) -> list[Mode]:
@@ -90,9 +89,8 @@ class KeyPictures:
         Args:
             goal_maps: [1,...] of `encode_goals`.
         """
-        said = [self.network.recogniser(self.network.encoder.meet(
-            part, goal_maps.expand(len(part), *goal_maps.shape[1:]), None)[1])
-            for part in self._seen.split(64)]
+        said = [self.network.compare(part, goal_maps.expand(len(part), *goal_maps.shape[1:]))
+                for part in self._seen.split(64)]
         seen = self._in_metres(Recognition(*map(torch.cat, zip(*said, strict=True))))
         return modes_of(_votes(compose(self.poses, seen.there), seen, turned=False))
 
@@ -109,8 +107,8 @@ class KeyPictures:
             where there is none so close.
         """
         network = self.network
-        seen = network.encoder.see(image, network.compute_dtype)
-        query = _pooled(directions(apply(network.encoder.query, seen)))[0]
+        seen = network.see(image)
+        query = _pooled(directions(apply(network.encoder.query, seen[:, 0])))[0]
         alike = (self._pooled @ query.T).unflatten(0, (len(self.poses), -1))  # [K,keys,query]
         score = (alike.amax(1).mean(1) + alike.amax(2).mean(1)).numpy()
         rows = np.argsort(-score)[:ALIKE]
@@ -121,8 +119,8 @@ class KeyPictures:
             close = np.argsort(off)[:TRACKED]
             rows = np.union1d(rows, close)
             close = close[off[close] < 1]
-        said = network.recogniser(network.encoder.meet(
-            seen.expand(len(rows), -1, -1, -1), self._maps[torch.from_numpy(rows)], None)[1])
+        said = network.compare(seen.expand(len(rows), *seen.shape[1:]),
+                               self._maps[torch.from_numpy(rows)])
         found = self._in_metres(said)
         poses = compose(self.poses[rows], between(found.there, np.zeros(3)))
         votes = _votes(poses, found, turned=True)

@@ -20,6 +20,7 @@ from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Latents, Policy, PolicyOutput
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.search.look import BINS, COLUMNS, Look
+from vn_nav.policy.search.rules import Rules
 from vn_nav.policy.search.taught import TaughtPlace
 
 LOG_SCALES = -3.5, 2.0  # of the position, log of metres: 0.03 to 7.4 m
@@ -109,6 +110,7 @@ class SearchPolicy(Policy):
 
     Attributes:
         taught: the place that it knows, of a recorded drive; None: none.
+        rules: of the decisions; None: the usual ones.
     """
 
     uses_odometry = True
@@ -117,6 +119,7 @@ class SearchPolicy(Policy):
     def _build(self, config: NetworkConfig) -> None:
         pixels = config.pixel_mean, config.pixel_std
         self.taught: TaughtPlace | None = None
+        self.rules: Rules | None = None
         self.tracker = self.places = self.routes = self.around = None
         self.encoder = Matching(config.size, config.channels, config.features, config.blocks,
                                 *pixels)
@@ -125,19 +128,51 @@ class SearchPolicy(Policy):
         self.heads = nn.ModuleDict()
         self.target_side = self.cell = 0
 
+    def encode_goals(self, goals: Tensor) -> Tensor:
+        """What `look` compares pictures with, of goals [G,3,S,S] uint8: [G,2,C,h,w].
+
+        Of each the picture, and the mirrored picture.
+        """
+        return torch.stack([self.encoder.encode_goals(pictures, self.compute_dtype)
+                            for pictures in (goals, goals.flip(-1))], dim=1)
+
+    def see(self, pictures: Tensor) -> Tensor:
+        """What `compare` takes of pictures [N,3,S,S] uint8 and their mirror images: [N,2,...]."""
+        return torch.stack([self.encoder.see(own, self.compute_dtype)
+                            for own in (pictures, pictures.flip(-1))], dim=1)
+
+    def compare(self, seen: Tensor, goal_maps: Tensor) -> Recognition:
+        """Where the goals stand in N pictures.
+
+        A mirrored place is a place as well: what is said of it, mirrored back, is a second opinion
+        whose errors are others.
+
+        Args:
+            seen: [N,2,...] of `see`; goal_maps: [N,2,...] of `encode_goals`.
+        """
+        own, other = (self.recogniser(self.encoder.meet(seen[:, k], goal_maps[:, k], None)[1])
+                      for k in range(2))
+        return agreed(own, mirrored(other))
+
     def look(self, image: Tensor, goal_maps: Tensor, goal_index: Tensor | None = None) -> Look:
-        """What is seen.
+        """What is seen, in pictures and their mirror images together.
 
         Args:
             image: [N,3,S,S] uint8.
             goal_maps: of `encode_goals`.
             goal_index: [N] int64, the goal of each picture; left out: goal n belongs to picture n.
         """
-        _, features = self.encode(image, goal_maps, goal_index)
-        seen = self.recogniser(features)
-        return Look(self.ranges(image, self.compute_dtype), seen.position,
-                    PER_AXIS * seen.log_scale.exp(), seen.heading,
-                    heading_deviation(seen.log_concentration), seen.co_visible, seen.arrived)
+        if goal_index is not None:
+            goal_maps = goal_maps.index_select(0, goal_index)
+        seen = self.compare(self.see(image), goal_maps)
+        return Look(self.see_ranges(image), seen.position, PER_AXIS * seen.log_scale.exp(),
+                    seen.heading, heading_deviation(seen.log_concentration), seen.co_visible,
+                    seen.arrived)
+
+    def see_ranges(self, image: Tensor) -> Tensor:
+        """Log-probabilities [N,COLUMNS,BINS] of pictures and their mirror images together."""
+        own, other = self.ranges(torch.cat([image, image.flip(-1)]), self.compute_dtype).chunk(2)
+        return torch.logaddexp(own, other.flip(1)) - math.log(2)
 
     def latents(self, obs: Observation, starts: Tensor, state: RecurrentState | None = None,
                 goal_maps: Tensor | None = None) -> tuple[Latents, RecurrentState]:
@@ -155,6 +190,23 @@ class SearchPolicy(Policy):
             UserError: always.
         """
         raise _no_actor()
+
+
+def mirrored(said: Recognition) -> Recognition:
+    """What is said of pairs of pictures, of the mirrored ones: left is right."""
+    sides = said.position.new_tensor([1.0, -1.0])
+    return said._replace(position=sides * said.position, heading=sides * said.heading)
+
+
+def agreed(one: Recognition, other: Recognition) -> Recognition:
+    """What two opinions of the same pairs come to: means, of poses by how sure each is."""
+    means = [(a + b) / 2 for a, b in zip(one, other, strict=True)]
+    share = torch.sigmoid(2 * (other.log_scale - one.log_scale)).unsqueeze(1)
+    heading = (one.log_concentration.exp().unsqueeze(1) * one.heading
+               + other.log_concentration.exp().unsqueeze(1) * other.heading)
+    return Recognition(*means)._replace(
+        position=share * one.position + (1 - share) * other.position,
+        heading=F.normalize(heading, dim=1, eps=1e-6))
 
 
 def heading_deviation(log_concentration: Tensor) -> Tensor:

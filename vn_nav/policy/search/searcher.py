@@ -18,6 +18,7 @@ from vn_nav.policy.search.costmap import ROOM, Costmap
 from vn_nav.policy.search.grid import OccupancyGrid
 from vn_nav.policy.search.hypotheses import MISS_BELOW, Hypotheses, Hypothesis, apart
 from vn_nav.policy.search.lookahead import ENOUGH, best_turns, cost_at
+from vn_nav.policy.search.rules import Rules
 
 # Decisions of exploring that show less new floor than this: where it leads there is none.
 IDLE, IDLE_M2 = 12, 0.5
@@ -27,27 +28,6 @@ TIGHT = 0.08  # m that obstacles are passed closer then
 FORGET_EVERY = 60  # decisions
 IN_VAIN = 2.5  # contacts of late: what it explores is out of reach
 BLOCKED_M, BLOCKED_RAD = 0.2, math.radians(20)  # a contact is remembered about its place
-
-
-@dataclasses.dataclass(frozen=True)
-class Rules:
-    """Numbers of the decisions, fitted on training houses."""
-
-    follow_from: float = 2.0  # evidence of a hypothesis that the robot drives to
-    near_m: float = 1.2  # so near a hypothesis place and heading are planned together
-    near_worth: float = 0.3  # probability, less the price of the way, that makes it worth it
-    decision_price: float = 0.03  # as a probability of having arrived
-    looks_in_doubt: float = 2  # where the robot stands on a hypothesis, and has not arrived
-    turn_cost: float = 0.05  # m that a turn is worth
-    look_cost: float = 0.12  # m that a turn to look is worth
-    look_worth: float = 0.6  # m that a square metre of unknown floor in view is worth
-    look_most: float = 1.5  # m
-    look_from: float = 0.4  # m^2 in view that make a look
-    contact_cost: float = 4.0  # for each metre that an obstacle would cut off
-    graze_cost: float = 0.6  # m for passing an obstacle at the footprint, none from `graze_m` on
-    graze_m: float = 0.2
-    backward_cost: float = 0.3  # m
-    back_cost: float = 0.3  # m for turning back where the robot has just turned from
 
 
 @dataclasses.dataclass
@@ -94,7 +74,7 @@ class Searcher:
     def reset(self) -> None:
         """Begin a search: an empty map about the robot."""
         self.grid = OccupancyGrid(self.footprint)
-        self.hypotheses = Hypotheses()
+        self.hypotheses = Hypotheses(self.rules.gathers, self.rules.refutes)
         self.pose = np.zeros(3)
         self.aim, self.arrival = 'look', 0.0
         self.seen: Sight | None = None
@@ -204,7 +184,8 @@ class Searcher:
             return
         track = np.array(self._track)
         spread = np.ptp(track[:, :2], axis=0).max()
-        if spread < STUCK_M and track[-1, 2] - track[0, 2] < STUCK_M2:
+        if (self.rules.unsticks and spread < STUCK_M
+                and track[-1, 2] - track[0, 2] < STUCK_M2):
             self._stuck_for = STUCK
             self._blocked = self._blocked[-2:]
         self._track.pop(0)
