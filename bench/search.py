@@ -18,9 +18,9 @@ processes (`--rows`). Prints a Markdown table, ready for docs/results.md.
   **low**, **high**, **narrow**, **wide**: cameras 0.4 and 1.4 m high, fields of view of 70 and 110
   degrees (`bench/robots`), of a policy that was trained with another. All in the houses of
   `--split`, declared stop alone.
-- **one_look**, **no_refuting**, **no_looking**, **no_squeezing**: a part taken away. **truth**,
-  **truth_scan**: where the goal is comes from the simulator, not from the picture; with the scan
-  nothing that is seen decides any more. Declared stop alone.
+- **one_look**, **no_refuting**, **no_fitting**, **no_looking**, **no_squeezing**: a part taken
+  away. **truth**, **truth_scan**: where the goal is comes from the simulator, not from the
+  picture; with the scan nothing that is seen decides any more. Declared stop alone.
 """
 
 from __future__ import annotations
@@ -107,6 +107,7 @@ ROWS = {
     'wide': Row('field of view 110 deg', robot='wide'),
     'one_look': Row('evidence of the newest look alone', rules=Rules(gathers=False)),
     'no_refuting': Row('no evidence is lost', rules=Rules(refutes=False)),
+    'no_fitting': Row('the goal is not fitted to the map', rules=Rules(registers=False)),
     'no_looking': Row('no turns to look', rules=Rules(look_from=math.inf)),
     'no_squeezing': Row('a stuck robot goes on as before', rules=Rules(unsticks=False)),
     'truth': Row('true recognition', truth=True),

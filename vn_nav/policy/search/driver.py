@@ -14,10 +14,11 @@ from vn_nav.measured_ranges import Scan, laser_scan
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
 from vn_nav.policy.search.costmap import Costmap
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
-from vn_nav.policy.search.lens import in_metres
+from vn_nav.policy.search.lens import in_metres, ranges_in_metres
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.recall import Recall
+from vn_nav.policy.search.registration import Registration
 from vn_nav.policy.search.searcher import Searcher, Sight
 
 
@@ -56,6 +57,8 @@ class SearchDriver:
         # A goal that is nowhere, far and near: it explores, follows a guess, approaches it.
         for co_visible, away in ((0.0, 1.0), (0.99, 2.5), (0.99, 1.0)):
             searcher.reset()
+            searcher.registration = Registration(
+                searcher.bearings, np.full((COLUMNS, BINS), 1 / BINS))
             sight = Sight(np.eye(BINS, dtype=np.float32)[np.full(COLUMNS, BINS - 8)],
                           np.array([away, 0.0]), 0.3, np.array([1.0, 0.0]), co_visible, 0.0)
             for action in (-1, int(np.argmax(searcher.moves[:, 0]))):  # the second meets something
@@ -105,6 +108,9 @@ class SearchDriver:
         for n, (searcher, sight) in enumerate(zip(self.searchers, sights, strict=True)):
             if starts[n]:
                 searcher.reset()
+                ranges = ranges_in_metres(self.network.goal_ranges(goal_maps[n:n + 1]),
+                                          self._bearings, zoom)
+                searcher.registration = Registration(bearings, ranges[0].exp().numpy())
             recall = None
             # Through another lens the key pictures look different.
             if self.recalls is not None and self._keys is not None and (

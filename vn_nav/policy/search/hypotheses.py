@@ -27,13 +27,15 @@ class Hypothesis:
     """A pose that the goal may have.
 
     Attributes:
-        pose: [3] x, y [m], yaw [rad] on the map.
+        pose: [3] x, y [m], yaw [rad] on the map, by all that is known.
+        voted: [3], by the votes alone.
         weight: evidence: sum of odds over distance.
         precision: of the position [1/m^2], of the votes together.
         refuted: how often the robot stood at it, or was on its way there, in vain.
         doubted: looks in a row, standing there, that did not say so.
         likeliest: the highest probability of having arrived, of these looks.
         nearest: the least cost to go on the way there [m]; waited: decisions since then.
+        told: somebody who knows the place says where it is.
     """
 
     pose: np.ndarray
@@ -44,6 +46,11 @@ class Hypothesis:
     waited: int = 0
     doubted: int = 0
     likeliest: float = 0.0
+    told: bool = False
+    voted: np.ndarray = dataclasses.field(init=False)
+
+    def __post_init__(self):
+        self.voted = np.array(self.pose, float)
 
     def is_stuck(self, cost: float) -> bool:
         """Whether the robot, on its way here at a cost, has come no nearer for too long."""
@@ -104,9 +111,9 @@ class Hypotheses:
         """
         near = self._near(pose)
         if near is None:
-            self.all.append(Hypothesis(np.array(pose, float), weight, precision))
+            self.all.append(Hypothesis(np.array(pose, float), weight, precision, told=True))
             return self.all[-1]
-        near.weight = min(near.weight + weight, WEIGHT_MOST)
+        near.weight, near.told = min(near.weight + weight, WEIGHT_MOST), True
         return near
 
     def refute(self, own: Hypothesis) -> None:
@@ -133,7 +140,7 @@ class Hypotheses:
     def _near(self, pose: np.ndarray) -> Hypothesis | None:
         """The one with most evidence of those that a vote for a pose is for."""
         near = [own for own in self.all
-                if apart(own.pose, pose)[0] < MERGE_M and apart(own.pose, pose)[1] < MERGE_RAD]
+                if apart(own.voted, pose)[0] < MERGE_M and apart(own.voted, pose)[1] < MERGE_RAD]
         return max(near, key=lambda own: own.weight, default=None)
 
     def _vote(self, pose: np.ndarray, weight: float, precision: float) -> None:
@@ -145,8 +152,9 @@ class Hypotheses:
             return
         # The newest look counts at least a fifth: odometry drifts, and near looks are better.
         gain = max(precision / (own.precision + precision), 0.2)
-        own.pose[:2] += gain * (pose[:2] - own.pose[:2])
-        own.pose[2] = wrap_angle(own.pose[2] + gain * wrap_angle(pose[2] - own.pose[2]))
+        own.voted[:2] += gain * (pose[:2] - own.voted[:2])
+        own.voted[2] = wrap_angle(own.voted[2] + gain * wrap_angle(pose[2] - own.voted[2]))
+        own.pose = own.voted.copy()
         own.precision = min(own.precision + precision, 400.0)
         own.weight = min(own.weight + weight / (1 + own.refuted), WEIGHT_MOST)
 

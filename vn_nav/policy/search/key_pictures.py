@@ -80,7 +80,8 @@ class KeyPictures:
         pictures = torch.from_numpy(place.pictures)
         self._seen = torch.cat([network.see(part) for part in pictures.split(64)])
         self._maps = torch.cat([network.encode_goals(part) for part in pictures.split(64)])
-        self._pooled = _pooled(self._maps[:, 0]).flatten(0, 1)
+        self._pooled = _pooled(network.encoder.encode_goals(pictures, network.compute_dtype)
+                               ).flatten(0, 1)
 
     @torch.inference_mode()
     def poses_of_goal(self, goal_maps: Tensor) -> list[Mode]:

@@ -34,9 +34,16 @@ def in_metres(look: Look, bearings: np.ndarray, zoom: float) -> Look:
         look.position, look.position_sigma, look.heading, look.heading_sigma, zoom)
     arrived = arrival_by_pose(position, sigma, heading, heading_sigma) * torch.sigmoid(
         look.co_visible)
+    return Look(ranges_in_metres(look.ranges, bearings, zoom), position, sigma, heading,
+                heading_sigma, look.co_visible, torch.logit(arrived, 1e-6))
+
+
+def ranges_in_metres(ranges: Tensor, bearings: np.ndarray, zoom: float) -> Tensor:
+    """The same for log-probabilities [N,COLUMNS,BINS] of ranges alone; see `in_metres`."""
+    if abs(zoom - 1) < SAME:
+        return ranges
     stretch = zoom * np.cos(bearings) / np.cos(bearings_through(bearings, zoom))
-    return Look(_shifted(look.ranges, torch.from_numpy(np.log(stretch)).float()), position, sigma,
-                heading, heading_sigma, look.co_visible, torch.logit(arrived, 1e-6))
+    return _shifted(ranges, torch.from_numpy(np.log(stretch)).float())
 
 
 def pose_in_metres(position: Tensor, sigma: Tensor, heading: Tensor, heading_sigma: Tensor,

@@ -129,12 +129,18 @@ class SearchPolicy(Policy):
         self.target_side = self.cell = 0
 
     def encode_goals(self, goals: Tensor) -> Tensor:
-        """What `look` compares pictures with, of goals [G,3,S,S] uint8: [G,2,C,h,w].
+        """What is kept of goals [G,3,S,S] uint8: [G,2*C*h*w+COLUMNS*BINS].
 
-        Of each the picture, and the mirrored picture.
+        What pictures are compared with, of each goal and of its mirror image; behind it the ranges
+        that are seen in it, as log-probabilities.
         """
-        return torch.stack([self.encoder.encode_goals(pictures, self.compute_dtype)
-                            for pictures in (goals, goals.flip(-1))], dim=1)
+        maps = [self.encoder.encode_goals(pictures, self.compute_dtype).flatten(1)
+                for pictures in (goals, goals.flip(-1))]
+        return torch.cat([*maps, self.see_ranges(goals).flatten(1).to(maps[0].dtype)], dim=1)
+
+    def goal_ranges(self, goal_maps: Tensor) -> Tensor:
+        """Log-probabilities [G,COLUMNS,BINS] float32 of the ranges in goals, of `encode_goals`."""
+        return goal_maps[:, -COLUMNS * BINS:].float().unflatten(1, (COLUMNS, BINS))
 
     def see(self, pictures: Tensor) -> Tensor:
         """What `compare` takes of pictures [N,3,S,S] uint8 and their mirror images: [N,2,...]."""
@@ -148,9 +154,10 @@ class SearchPolicy(Policy):
         whose errors are others.
 
         Args:
-            seen: [N,2,...] of `see`; goal_maps: [N,2,...] of `encode_goals`.
+            seen: [N,2,...] of `see`; goal_maps: [N,...] of `encode_goals`.
         """
-        own, other = (self.recogniser(self.encoder.meet(seen[:, k], goal_maps[:, k], None)[1])
+        maps = goal_maps[:, :-COLUMNS * BINS].unflatten(1, seen.shape[1:])
+        own, other = (self.recogniser(self.encoder.meet(seen[:, k], maps[:, k], None)[1])
                       for k in range(2))
         return agreed(own, mirrored(other))
 

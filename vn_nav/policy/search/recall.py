@@ -161,7 +161,7 @@ class Recall:
             if own is None:
                 own = self._suggested[k] = searcher.hypotheses.suggest(
                     compose(frame, goal.pose), GOAL_WEIGHT * goal.share, goal.precision)
-            own.pose[:] = compose(frame, goal.pose)
+            own.pose[:] = own.voted[:] = compose(frame, goal.pose)
             if own.refuted and self._tries[k] and apart(own.pose, searcher.pose)[0] > TRIED_M:
                 # It did not get there: that says nothing of the goal.
                 self._tries[k] -= 1

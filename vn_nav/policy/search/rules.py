@@ -27,4 +27,5 @@ class Rules:
     # What `bench/search.py` takes away, to measure what it adds.
     gathers: bool = True  # evidence over looks; else the newest vote alone counts
     refutes: bool = True  # hypotheses lose evidence where the goal is not recognised
+    registers: bool = True  # the goal picture's ranges say where on the map it fits
     unsticks: bool = True  # a robot that is stuck passes obstacles closer

@@ -18,6 +18,7 @@ from vn_nav.policy.search.costmap import ROOM, Costmap
 from vn_nav.policy.search.grid import OccupancyGrid
 from vn_nav.policy.search.hypotheses import MISS_BELOW, Hypotheses, Hypothesis, apart
 from vn_nav.policy.search.lookahead import ENOUGH, best_turns, cost_at
+from vn_nav.policy.search.registration import Registration
 from vn_nav.policy.search.rules import Rules
 
 # Decisions of exploring that show less new floor than this: where it leads there is none.
@@ -27,6 +28,7 @@ STUCK, STUCK_M, STUCK_M2 = 24, 0.9, 1.0
 TIGHT = 0.08  # m that obstacles are passed closer then
 FORGET_EVERY = 60  # decisions
 IN_VAIN = 2.5  # contacts of late: what it explores is out of reach
+REGISTERED = 2  # hypotheses that are fitted to the map
 BLOCKED_M, BLOCKED_RAD = 0.2, math.radians(20)  # a contact is remembered about its place
 
 
@@ -54,6 +56,7 @@ class Searcher:
     Attributes:
         pose: [3] x, y [m], yaw [rad] on the map.
         grid, hypotheses: what it knows.
+        registration: fits the goal picture to the map; None: nobody has seen it.
         arrival: probability that the robot has arrived, by the newest picture.
         aim: in a word, what it was about: 'follow', 'turn', 'explore', 'look' or 'lost'.
     """
@@ -76,6 +79,7 @@ class Searcher:
         self.grid = OccupancyGrid(self.footprint)
         self.hypotheses = Hypotheses(self.rules.gathers, self.rules.refutes)
         self.pose = np.zeros(3)
+        self.registration: Registration | None = None
         self.aim, self.arrival = 'look', 0.0
         self.seen: Sight | None = None
         self._last = -1
@@ -112,9 +116,18 @@ class Searcher:
         self.arrival, self.seen = sight.arrived, sight
         if recall is not None:
             recall(self)
+        self._register()
         action = self._decide()
         self._last = action
         return action
+
+    def _register(self) -> None:
+        """Say by the map where the likeliest hypotheses are."""
+        if self.registration is None or not self.rules.registers:
+            return
+        for own in self.hypotheses.worth_trying(self.rules.follow_from)[:REGISTERED]:
+            if not own.told:
+                own.pose = self.registration.fit(self.grid, own.voted, own.precision)
 
     def reset_odometry(self) -> None:
         """The next odometry is in another frame: the nominal move counts until then."""
