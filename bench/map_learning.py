@@ -66,18 +66,35 @@ def act(network: MapNetwork, views: Views, decoding: str, generator: torch.Gener
 
 
 class MapActor:
-    """A network as an actor of `vn_nav.evaluation.evaluator`; it declares as the planner does."""
+    """Planner or network as an actor of `vn_nav.evaluation.evaluator`; both declare alike.
 
-    def __init__(self, env, eyes, network: MapNetwork, decoding: str, seed: int, threshold: float):
-        self._env, self._network, self._decoding = env, network.eval(), decoding
-        self._threshold = threshold
-        self._driver = MapDriver(eyes, env.num_envs, plans=network.advised)
+    Args:
+        env: where.
+        eyes: the networks of the checkpoint.
+        network: None: the planner alone, whose actions are those of `evaluator.PolicyActor`.
+        decoding, seed: of the network's actions.
+        threshold: probability of having arrived above which it declares.
+        episodes: of each environment; what comes after them is not looked at.
+    """
+
+    def __init__(self, env, eyes, network: MapNetwork | None, decoding: str, seed: int,
+                 threshold: float, episodes: int):
+        self._env, self._network, self._decoding = env, network, decoding
+        self._threshold, self._left = threshold, np.full(env.num_envs, episodes)
+        self._driver = MapDriver(eyes, env.num_envs, plans=network is None or network.advised)
         self._generator = torch.Generator().manual_seed(seed)
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
-        views = self._driver.look(observation, self._env.goals, reset)
-        action, _, _ = act(self._network, views, self._decoding, self._generator)
-        return np.where(views.arrival > self._threshold, self._env.declare_action, action)
+        self._left[reset] -= 1
+        for n in np.flatnonzero(self._left < 0):
+            self._driver.searchers[n].resting = True
+        if self._network is None:
+            action, arrival = self._driver.advise(observation, self._env.goals, reset)
+        else:
+            views = self._driver.look(observation, self._env.goals, reset)
+            arrival = views.arrival
+            action, _, _ = act(self._network, views, self._decoding, self._generator)
+        return np.where(arrival > self._threshold, self._env.declare_action, action)
 
 
 class Examples:

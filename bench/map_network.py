@@ -42,7 +42,7 @@ from map_views import MapDriver, Views
 from vn_nav.cli.scenes import split_scenes
 from vn_nav.cli.world import load_for, machine, make_env, make_env_for
 from vn_nav.errors import UserError
-from vn_nav.evaluation.evaluator import DECLARED, PolicyActor, parts_of, run_episodes
+from vn_nav.evaluation.evaluator import DECLARED, parts_of, run_episodes
 from vn_nav.evaluation.metrics import summarise
 from vn_nav.files import write_file
 from vn_nav.policy.checkpoint import LoadedCheckpoint
@@ -291,14 +291,12 @@ def evaluate(checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> None:
                 envs[chunk] = make_env_for(checkpoint, part, count, stop=DECLARED, own=False,
                                            max_decisions=options.max_decisions)
             env = envs[chunk]
-            if training is None:
-                actor = PolicyActor(env, checkpoint.network, decoding, options.seed + chunk,
-                                    threshold)
-            else:
+            network = None
+            if training is not None:
                 network = MapNetwork(VARIANTS[name.split('_')[0]])
                 network.load_state_dict(training['network'])
-                actor = MapActor(env, checkpoint.network, network, decoding, options.seed + chunk,
-                                 threshold)
+            actor = MapActor(env, checkpoint.network, network, decoding, options.seed + chunk,
+                             threshold, rounds)
             episodes += run_episodes(env, actor, rounds * count, seed=options.seed + chunk,
                                      robot=env.robot)
         entry = {'row': name, 'conditions': wanted, 'figures': summarise(episodes),

@@ -19,7 +19,13 @@ from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.search.costmap import Costmap
 from vn_nav.policy.search.grid import CELL, KNOWN, MOST, OccupancyGrid
 from vn_nav.policy.search.hypotheses import AGAIN, Hypotheses, Hypothesis, apart
-from vn_nav.policy.search.look import COLUMNS, RANGE_EDGES, column_bearings, median_ranges
+from vn_nav.policy.search.look import (
+    COLUMNS,
+    RANGE_EDGES,
+    Look,
+    column_bearings,
+    median_ranges,
+)
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.searcher import Searcher
 
@@ -53,19 +59,23 @@ class MapSearcher(Searcher):
 
     Attributes:
         touched: whether odometry says that the last move was stopped.
+        resting: nobody asks for this robot any more; it stays as it is.
     """
 
     def __init__(self, *args, plans: bool, **options):
-        self.plans, self.touched = plans, False
+        self.plans, self.touched, self.resting = plans, False, False
         super().__init__(*args, **options)
 
     def reset(self) -> None:
         """Begin a search."""
-        super().reset()
-        self.touched = False
+        if not self.resting:
+            super().reset()
+            self.touched = False
 
     def step(self, sight, last_action, *args, **options) -> int:
-        """As `Searcher.step`; -1 without plans."""
+        """As `Searcher.step`; -1 without plans, 0 where it rests."""
+        if self.resting:
+            return 0
         self._last = last_action  # what was done need not be what it said
         return super().step(sight, last_action, *args, **options)
 
@@ -104,13 +114,41 @@ class MapDriver:
         self.searchers = [MapSearcher(config.moves, column_bearings(config.view), RANGE_EDGES,
                                       config.footprint, plans=plans) for _ in range(num_envs)]
         self._policy.search.searchers[:] = self.searchers
+        self._policy.search.network = OpenEyes(network, self.searchers)  # type: ignore[assignment]
+        self._maps = np.zeros((num_envs, CHANNELS, PIXELS, PIXELS), np.uint8)
+
+    def advise(self, observation: dict, goals: np.ndarray, reset: np.ndarray
+               ) -> tuple[np.ndarray, np.ndarray]:
+        """Enter a picture of each robot into its map, as `BatchedPolicy.act`.
+
+        Returns:
+            The planner's actions [N] and probabilities of having arrived [N].
+        """
+        return self._policy.act(observation, goals, reset), self._policy.arrival
 
     def look(self, observation: dict, goals: np.ndarray, reset: np.ndarray) -> Views:
-        """Enter a picture of each robot into its map, and show it; as `BatchedPolicy.act`."""
-        advice = self._policy.act(observation, goals, reset)
-        maps = np.stack([map_crops(own.grid, own.hypotheses, own.pose) for own in self.searchers])
+        """As `advise`, and show the maps."""
+        advice, arrival = self.advise(observation, goals, reset)
+        for n, own in enumerate(self.searchers):
+            if not own.resting:
+                self._maps[n] = map_crops(own.grid, own.hypotheses, own.pose)
         numbers = numbers_of(self.searchers, np.where(reset, -1, observation['last_action']))
-        return Views(maps, numbers, advice, self._policy.arrival)
+        return Views(self._maps.copy(), numbers, advice, arrival)
+
+
+class OpenEyes:
+    """The networks of a `SearchPolicy`, which do not look where robots rest."""
+
+    def __init__(self, network: SearchPolicy, searchers: list[MapSearcher]):
+        self._network, self._searchers = network, searchers
+        self.config, self.taught = network.config, network.taught
+
+    def look(self, image: torch.Tensor, goal_maps: torch.Tensor) -> Look:
+        """As `SearchPolicy.look`; zeros of the others."""
+        rows = torch.tensor([not own.resting for own in self._searchers])
+        seen = self._network.look(image[rows], goal_maps[rows])
+        return Look(*(torch.zeros(len(image), *part.shape[1:]).index_put((rows,), part)
+                      for part in seen))
 
 
 def map_crops(grid: OccupancyGrid, hypotheses: Hypotheses, pose: np.ndarray) -> np.ndarray:

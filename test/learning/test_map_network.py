@@ -12,6 +12,7 @@ from paths import ROOT
 from small_env import make
 from small_search import small_search, write_small_search
 
+from vn_nav.evaluation.evaluator import PolicyActor, run_episodes
 from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.search.grid import CELL, OccupancyGrid
 from vn_nav.policy.search.hypotheses import Hypotheses
@@ -192,6 +193,19 @@ def test_reinforcement_prefers_what_was_paid(learning, drive):
     figures = learning.reinforce(network, optimiser, rollout, learning.Ppo(), False, generator)
     assert chance(2) > before + 0.01 and chance(1) < other
     assert all(math.isfinite(value) for value in figures.values())
+
+
+def test_what_rests_does_not_change_what_the_others_do(learning, drive):
+    """Episodes as `PolicyActor` drives them; an environment with enough of them is left alone."""
+    threshold = float(np.quantile([told.arrival for _, told, _, _ in drive[0]], 0.8))
+    network = small_search()
+    env = make(size=48, odometry='drift', stop='declared', max_decisions=8)
+    before = run_episodes(env, PolicyActor(env, network, 'greedy', 0, threshold), 8, seed=3,
+                          robot=env.robot)
+    actor = learning.MapActor(env, network, None, 'greedy', 0, threshold, 2)
+    assert run_episodes(env, actor, 8, seed=3, robot=env.robot) == before
+    assert len({episode.decisions for episode in before}) > 1  # some wait for others
+    env.close()
 
 
 def test_one_command_trains_measures_and_goes_on_where_it_was(learning, monkeypatch, capsys,
