@@ -52,7 +52,7 @@ from vn_nav.scenes import rooms_of
 
 PLANNER = 'planner'
 VARIANTS = {'network': False, 'both': True}  # whether it is told the planner's action
-STAGES = ('imitated', 'reinforced')
+RUNS = tuple(f'{variant}_{stage}' for variant in VARIANTS for stage in ('imitated', 'reinforced'))
 EXAMPLES = 40_000  # kept; 16 kB each
 BATCH = 256
 LEARNING_RATES = 6e-4, 1e-4  # of the imitation, first and last
@@ -230,28 +230,30 @@ def reinforcement(training: Training, env, eyes, threshold: float, minutes: floa
 
 
 def train(checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> None:
-    """Every variant through every stage, as far as it is not done."""
+    """Every network that is asked for, as far as it has not learned yet."""
     env, threshold = None, stop_threshold(checkpoint, options)
     info = checkpoint.info
-    for variant in options.variants:
-        before = None
-        for stage, minutes in zip(STAGES, (options.minutes, options.reinforce_minutes),
-                                  strict=True):
-            path = options.out / f'{variant}_{stage}.pt'
-            training = Training.at(path, VARIANTS[variant],
-                                   LEARNING_RATES[0] if stage == 'imitated' else
-                                   Ppo.learning_rate, options.train_seed, before)
-            before = path
-            if training.seconds >= 60 * minutes:
-                continue
-            if env is None:
-                env = make_env(split_scenes(info['simulator'], 'train', options.train_houses),
-                               options.robots, size=checkpoint.config.size, stop=DECLARED,
-                               randomisation=info['randomisation'], odometry='drift',
-                               actions=checkpoint.config.actions,
-                               privileged=('explorer_action',), **ENVIRONMENT)
-            learn = imitation if stage == 'imitated' else reinforcement
-            learn(training, env, checkpoint.network, threshold, minutes, options.train_seed)
+    for name in options.runs:
+        variant, stage = name.split('_')
+        imitated = stage == 'imitated'
+        minutes = options.minutes if imitated else options.reinforce_minutes
+        before = None if imitated else options.out / f'{variant}_imitated.pt'
+        if before is not None and not before.exists():
+            raise UserError('what is reinforced has imitated before', name,
+                            f'name {variant}_imitated among --runs as well')
+        training = Training.at(options.out / f'{name}.pt', VARIANTS[variant],
+                               LEARNING_RATES[0] if imitated else Ppo.learning_rate,
+                               options.train_seed, before)
+        if training.seconds >= 60 * minutes:
+            continue
+        if env is None:
+            env = make_env(split_scenes(info['simulator'], 'train', options.train_houses),
+                           options.robots, size=checkpoint.config.size, stop=DECLARED,
+                           randomisation=info['randomisation'], odometry='drift',
+                           actions=checkpoint.config.actions,
+                           privileged=('explorer_action',), **ENVIRONMENT)
+        learn = imitation if imitated else reinforcement
+        learn(training, env, checkpoint.network, threshold, minutes, options.train_seed)
     if env is not None:
         env.close()
 
@@ -262,18 +264,13 @@ def stop_threshold(checkpoint: LoadedCheckpoint, options: argparse.Namespace) ->
             else options.stop_threshold)
 
 
-def rows_of(options: argparse.Namespace) -> list[str]:
-    """Names of the rows."""
-    return [PLANNER, *(f'{variant}_{stage}' for variant in options.variants for stage in STAGES)]
-
-
 def evaluate(checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> None:
     """Measure every row that is not measured yet."""
     info, threshold = checkpoint.info, stop_threshold(checkpoint, options)
     scenes = split_scenes(info['simulator'], options.split, options.houses,
                           rooms_of(info['scenes'][0]) if info['scenes'] else None)
     envs: dict[int, object] = {}
-    for name in rows_of(options):
+    for name in (PLANNER, *options.runs):
         state = options.out / f'{name}.pt'
         decoding = 'greedy' if name == PLANNER else options.decoding
         wanted = {'checkpoint': info['sha256'], 'episodes': options.episodes, 'seed': options.seed,
@@ -324,7 +321,7 @@ def markdown(options: argparse.Namespace) -> str:
                 'less the planner, paired (95 %)', 'false stops', 'at the goal at some time',
                 'collisions', 'decisions']
     lines, planner = [headings, ['---'] * len(headings)], None
-    for name in rows_of(options):
+    for name in (PLANNER, *RUNS):
         path = row_path(options, name)
         if not path.exists():
             continue
@@ -356,7 +353,7 @@ def paired(difference: np.ndarray) -> str:
 def write_curves(options: argparse.Namespace) -> None:
     """All curves in one CSV file."""
     rows = []
-    for name in rows_of(options)[1:]:
+    for name in RUNS:
         path = options.out / f'{name}.pt'
         if path.exists():
             rows += [{'run': name, **row} for row in torch.load(path)['curve']]
@@ -372,7 +369,8 @@ def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('checkpoint', type=Path, help='of the architecture search')
-    parser.add_argument('--variants', nargs='+', choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument('--runs', nargs='+', choices=RUNS, default=list(RUNS), metavar='RUN',
+                        help=f'networks to train and to measure: {", ".join(RUNS)}')
     parser.add_argument('--minutes', type=float, default=25, help='of one core, of each imitation')
     parser.add_argument('--reinforce-minutes', type=float, default=15, help='of each PPO')
     parser.add_argument('--robots', type=int, default=32, help='that learn at once')
