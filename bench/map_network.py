@@ -153,7 +153,7 @@ class Watch:
 
 
 def imitation(training: Training, env, eyes, threshold: float, minutes: float, seed: int) -> None:
-    """DAgger against the explorer until the minutes are over."""
+    """Imitate the explorer (DAgger) until the minutes are over."""
     watch = Watch(training, 60 * minutes)
     if watch.share >= 1:
         return
