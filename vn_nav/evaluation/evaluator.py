@@ -231,11 +231,7 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
                         'measure arrival as well')
     rows: Rows = {}
     threshold = STOP_THRESHOLD if threshold is None else threshold
-    each = -(-episodes // len(scenes))
-    for chunk, begin in enumerate(range(0, len(scenes), SCENES_AT_ONCE)):
-        part = list(scenes[begin:begin + SCENES_AT_ONCE])
-        rounds = -(-each // max(1, ENVIRONMENTS // len(part)))
-        environments = len(part) * -(-each // rounds)
+    for chunk, (part, environments, rounds) in enumerate(parts_of(scenes, episodes)):
         for stop in stops:
             if stop == DECLARED and not network.config.declares:
                 continue
@@ -250,6 +246,22 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
                 if env.config.task != 'image' or env.simulator.capabilities.rewards:
                     break  # nothing to declare
     return rows
+
+
+def parts_of(scenes: Sequence[str], episodes: int) -> list[tuple[list[str], int, int]]:
+    """Scenes that are measured at once, with environments for them and episodes of each of these.
+
+    Args:
+        scenes: their names.
+        episodes: at least this many in all, the same number in each scene.
+    """
+    each = -(-episodes // len(scenes))
+    found = []
+    for begin in range(0, len(scenes), SCENES_AT_ONCE):
+        part = list(scenes[begin:begin + SCENES_AT_ONCE])
+        rounds = -(-each // max(1, ENVIRONMENTS // len(part)))
+        found.append((part, len(part) * -(-each // rounds), rounds))
+    return found
 
 
 def make_actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
