@@ -4,6 +4,7 @@
     python bench/photographs.py FOLDER --cameras known width level grey --no-drive
     python bench/photographs.py FOLDER --episodes 60 --json photographs.json
     python bench/photographs.py FOLDER --features sift xfeat --no-drive --every 6
+    python bench/photographs.py FOLDER --verify sift --every 6
 
 The folder is described in `photo_sequence.py`. Reports, for each way to take a photograph for the
 policy's camera (`CAMERAS`):
@@ -17,6 +18,10 @@ policy's camera (`CAMERAS`):
   of all other stretches truly overlap;
 - driving in the graph of the photographs (`vn_sim_bridge.recorded`): the right picture, the wrong
   one, random moves. Success is arrival, by the rule of the image task.
+
+With `--verify sift` also of local features of the full photographs, and of network and features
+together, which then drive as well (`vn_nav.policy.search.verification`). `--from K` leaves out the
+first K photographs: settings of the features were chosen on every sixth from the first on.
 """
 
 from __future__ import annotations
@@ -50,8 +55,11 @@ from vn_nav.learning.sight_figures import (
 from vn_nav.lens import zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.search.lens import in_metres
+from vn_nav.policy.search.driver import sights_of
+from vn_nav.policy.search.local_features import SIDE, compare, extract
 from vn_nav.policy.search.look import BINS, COLUMNS, Look, column_bearings
 from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
+from vn_nav.policy.search.verification import NONE, VERIFY, evidence, verified
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.recorded.image_graph import build_graph
@@ -63,7 +71,7 @@ STRETCHES = 10
 BATCH = 1000  # pairs
 NEAR = 0.3  # m: nearer, a bearing means nothing
 SURE = 30  # matches
-FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'bearing_deg',
+FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'posed', 'bearing_deg',
            'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'sure', 'sure_far',
            'recognised', 'recognisable')
 
@@ -79,14 +87,14 @@ class Pairs(NamedTuple):
     truth: np.ndarray  # [P,4] as of `relative_pose`
 
 
-def pairs_of(sequence: Sequence, every: int) -> Pairs:
+def pairs_of(sequence: Sequence, every: int, first: int = 0) -> Pairs:
     """All pairs of some of a sequence."""
-    chosen = np.arange(0, len(sequence), every)
+    chosen = np.arange(first, len(sequence), every)
     overlap = sequence.overlaps(chosen)
-    first, second = np.nonzero(~np.eye(len(chosen), dtype=bool))
-    own, back = overlap[first, second], overlap[second, first]
-    return Pairs(chosen, first, second, own, (own == 0) & (back == 0),
-                 sequence.relative(chosen[first], chosen[second]))
+    one, other = np.nonzero(~np.eye(len(chosen), dtype=bool))
+    own, back = overlap[one, other], overlap[other, one]
+    return Pairs(chosen, one, other, own, (own == 0) & (back == 0),
+                 sequence.relative(chosen[one], chosen[other]))
 
 
 def cameras_of(sequence: Sequence) -> dict[str, tuple[Camera, bool]]:
@@ -134,7 +142,7 @@ def judge(pairs: Pairs, score: np.ndarray, position: np.ndarray | None = None,
 
     Args:
         pairs: the pairs; score: [P].
-        position, heading: [P,2] of the second in the frame of the first.
+        position, heading: [P,2] of the second in the frame of the first; nan: not known.
         called: [P] bool: whether they are said to overlap.
         arrived: [P] score of having arrived; None: that of the overlap.
     """
@@ -150,6 +158,9 @@ def judge(pairs: Pairs, score: np.ndarray, position: np.ndarray | None = None,
         found |= {'called': float(called[sees].mean()),
                   'called_apart': float(called[pairs.apart].mean())}
     if position is not None and heading is not None:
+        posed = np.isfinite(position[:, 0])
+        found['posed'] = float(posed[sees].mean())
+        sees &= posed
         far = sees & (np.hypot(*pairs.truth[:, :2].T) > NEAR)
         gap = np.hypot(*(position - pairs.truth[:, :2])[sees].T)
         found |= {
@@ -193,12 +204,37 @@ def recognition(pairs: Pairs, score: np.ndarray) -> dict[str, float]:
     return {'recognised': float(right.mean()), 'recognisable': float(can.mean())}
 
 
+def judge_verified(sequence: Sequence, pairs: Pairs, said: Look) -> dict[str, dict[str, float]]:
+    """Rows of local features alone, and of what the network says with them."""
+    pitch = camera_pitch(sequence, None)
+    features = [extract(sequence.images[k], sequence.upright_fov) for k in pairs.chosen]
+    found = [compare(features[one], features[other], pitch)
+             for one, other in zip(pairs.first, pairs.second, strict=True)]
+    logits = np.array([evidence(own) for own in found])
+    turns = np.array([own.heading for own in found])
+    rows = {'features alone': judge(
+        pairs, logits[:, 0], np.array([own.position for own in found]),
+        np.column_stack([np.cos(turns), np.sin(turns)]), logits[:, 0] > 0, logits[:, 1])}
+    both = [verified(sight, own) for sight, own in zip(sights_of(said), found, strict=True)]
+    shown = np.array([sight.co_visible for sight in both])
+    rows['verified'] = judge(
+        pairs, shown, np.array([sight.position for sight in both]),
+        np.array([sight.heading for sight in both]), shown > 0.5,
+        np.array([sight.arrived for sight in both]))
+    return rows
+
+
+def camera_pitch(sequence: Sequence, wanted: float | None) -> float:
+    """Of the camera of a robot that took the sequence [rad down]."""
+    return float(np.median(sequence.poses[:, 3])) if wanted is None else wanted
+
+
 def drive(sequence: Sequence, network: SearchPolicy, camera: Camera, told: bool, episodes: int,
-          decisions: int) -> dict[str, dict]:
+          decisions: int, verify: str = NONE) -> dict[str, dict]:
     """Rows of episodes in the graph of the photographs."""
     every = np.arange(len(sequence))
-    images = sequence.pictures(camera, network.config.size, every)
-    pitch = float(np.median(sequence.poses[:, 3])) if camera.pitch is None else camera.pitch
+    images = sequence.pictures(camera, network.config.size if verify == NONE else SIDE, every)
+    pitch = camera_pitch(sequence, camera.pitch)
     spec = RobotSpec()
     robot = dataclasses.replace(spec, camera_fov=camera.fov if told else network.config.view,
                                 camera_pitch=pitch).with_actions(network.config.actions)
@@ -209,7 +245,7 @@ def drive(sequence: Sequence, network: SearchPolicy, camera: Camera, told: bool,
     env = make_env(graph, robot, min(episodes, evaluator.ENVIRONMENTS), stop=evaluator.ARRIVAL,
                    max_decisions=decisions, odometry='drift')
     rows = evaluator.make_actors(env, network, 'greedy', (
-        evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST), evaluator.STOP_THRESHOLD, 0)
+        evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST), evaluator.STOP_THRESHOLD, 0, verify=verify)
     found = {}
     for name, (actor, shown) in rows.items():
         env.set_shown_goal(shown)
@@ -245,7 +281,7 @@ def run(options: argparse.Namespace) -> None:
     for name in options.cameras:
         if name not in cameras:
             raise UserError(f'a camera is one of {", ".join(cameras)}', name, 'choose some')
-    pairs = pairs_of(sequence, options.every)
+    pairs = pairs_of(sequence, options.every, options.first)
     seen = pairs.overlap >= POSE_OVERLAP
     print(f'{len(sequence)} photographs, {math.degrees(sequence.fov):.0f} x '
           f'{math.degrees(sequence.upright_fov):.0f} deg; {len(pairs.first):,} pairs, '
@@ -259,6 +295,9 @@ def run(options: argparse.Namespace) -> None:
         rows[name] = judge(pairs, said.co_visible.numpy(), said.position.numpy(),
                            said.heading.numpy(), said.co_visible.numpy() > 0,
                            said.arrived.numpy())
+        if options.verify != NONE:
+            rows |= {f'{name}, {title}': row
+                     for title, row in judge_verified(sequence, pairs, said).items()}
     for name in options.features:
         for kind, counts in matched(name, sequence, pairs.chosen).items():
             score = counts[pairs.first, pairs.second]
@@ -268,8 +307,8 @@ def run(options: argparse.Namespace) -> None:
     if options.drive:
         camera, told = cameras[options.cameras[0]]
         result['drive'] = drive(sequence, network, camera, told, options.episodes,
-                                options.decisions)
-        print(f'\n| driving, {options.cameras[0]} | success | SPL | decisions |\n'
+                                options.decisions, options.verify)
+        print(f'\n| driving, {options.cameras[0]}, verify {options.verify} | success | SPL | decisions |\n'
               '|---|---|---|---|')
         for name, row in result['drive'].items():
             print(f'| {name} | {row["success"]:.2f} | {row["spl"]:.2f} | {row["decisions"]:.0f} |')
@@ -287,6 +326,8 @@ def main() -> int:
     parser.add_argument('--cameras', nargs='+', default=['width'], metavar='CAMERA',
                         help='the first one drives')
     parser.add_argument('--every', type=int, default=EVERY, help='photographs: every so many')
+    parser.add_argument('--from', type=int, default=0, dest='first', help='the first of them')
+    parser.add_argument('--verify', choices=VERIFY, default=NONE)
     parser.add_argument('--features', nargs='+', choices=FEATURES, default=(),
                         help='judge local features of the photographs as well')
     parser.add_argument('--no-drive', dest='drive', action='store_false')
