@@ -117,10 +117,12 @@ def report(pairs: Compared, co_visible: np.ndarray, arrival: np.ndarray) -> None
     truth = pairs.truth[rows]
     far = np.hypot(*truth[:, :2].T) > 0.3
     length = np.hypot(*position[far].T) / np.hypot(*truth[far, :2].T)
+    bearing = _degrees(angle_between(position[far], truth[far, :2]))
+    turned = np.column_stack([np.cos(turn), np.sin(turn)])
+    heading = _degrees(angle_between(turned, truth[:, 2:]))
     print(f'{len(rows)} motions, {seen[rows].mean():.2f} of pictures that overlap; median errors: '
-          f'bearing {_degrees(angle_between(position[far], truth[far, :2])):.1f} deg, heading '
-          f'{_degrees(angle_between(np.column_stack([np.cos(turn), np.sin(turn)]), truth[:, 2:])):.1f}'
-          f' deg; length {np.median(length):.2f} of the true one')
+          f'bearing {bearing:.1f} deg, heading {heading:.1f} deg; length {np.median(length):.2f} '
+          'of the true one')
 
 
 def _degrees(angles: np.ndarray) -> float:

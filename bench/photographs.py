@@ -54,8 +54,8 @@ from vn_nav.learning.sight_figures import (
 )
 from vn_nav.lens import zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint
-from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.driver import sights_of
+from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.local_features import SIDE, compare, extract
 from vn_nav.policy.search.look import BINS, COLUMNS, Look, column_bearings
 from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
@@ -71,9 +71,9 @@ STRETCHES = 10
 BATCH = 1000  # pairs
 NEAR = 0.3  # m: nearer, a bearing means nothing
 SURE = 30  # matches
-FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'posed', 'bearing_deg',
-           'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'sure', 'sure_far',
-           'recognised', 'recognisable')
+FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'posed',
+           'bearing_deg', 'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'sure',
+           'sure_far', 'recognised', 'recognisable')
 
 
 class Pairs(NamedTuple):
@@ -245,7 +245,8 @@ def drive(sequence: Sequence, network: SearchPolicy, camera: Camera, told: bool,
     env = make_env(graph, robot, min(episodes, evaluator.ENVIRONMENTS), stop=evaluator.ARRIVAL,
                    max_decisions=decisions, odometry='drift')
     rows = evaluator.make_actors(env, network, 'greedy', (
-        evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST), evaluator.STOP_THRESHOLD, 0, verify=verify)
+        evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST), evaluator.STOP_THRESHOLD, 0,
+        verify=verify)
     found = {}
     for name, (actor, shown) in rows.items():
         env.set_shown_goal(shown)
@@ -308,8 +309,8 @@ def run(options: argparse.Namespace) -> None:
         camera, told = cameras[options.cameras[0]]
         result['drive'] = drive(sequence, network, camera, told, options.episodes,
                                 options.decisions, options.verify)
-        print(f'\n| driving, {options.cameras[0]}, verify {options.verify} | success | SPL | decisions |\n'
-              '|---|---|---|---|')
+        print(f'\n| driving, {options.cameras[0]}, verify {options.verify} '
+              '| success | SPL | decisions |\n|---|---|---|---|')
         for name, row in result['drive'].items():
             print(f'| {name} | {row["success"]:.2f} | {row["spl"]:.2f} | {row["decisions"]:.0f} |')
     text = json.dumps(result)

@@ -39,9 +39,9 @@ class Recording(PolicyRuntime):
         super().__init__(checkpoint)
         self.poses, self.breaks = [], 0
 
-    def act(self, image, odometry=None, scan=None, zoom=1.0):
+    def act(self, image, odometry=None, scan=None, zoom=1.0, view=None):
         self.poses.append(odometry)
-        return super().act(image, odometry, scan, zoom)
+        return super().act(image, odometry, scan, zoom, view)
 
     def reset_odometry(self):
         self.breaks += 1

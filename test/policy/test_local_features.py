@@ -88,9 +88,11 @@ def test_a_motion_is_recovered(room, there):
 
 
 def test_a_turn_on_the_spot_is_short(room):
-    found = compare(features(room, 0, 0, 0), features(room, 0, 0, 0.2))
-    assert found.heading == pytest.approx(0.2, abs=math.radians(1.5))
-    assert np.hypot(*found.position) < 0.3
+    for turn in (0.0, 0.2):
+        found = compare(features(room, 0, 0, 0), features(room, 0, 0, turn))
+        assert found.inliers > 40
+        assert found.heading == pytest.approx(turn, abs=math.radians(1))
+        assert np.hypot(*found.position) < 0.05
 
 
 def test_a_camera_that_looks_down_is_turned_back(room):
@@ -114,10 +116,11 @@ def test_another_room_shares_nothing(room):
     for pose in ((0, 0, 0), (0.5, 0.2, 0.3)):
         found = compare(features(room, 0, 0, 0), features(other, *pose))
         assert found.rich and found.inliers == 0 and np.isnan(found.heading)
+        # Noise is like noise: it may be in view, but nobody has arrived.
         co_visible, arrived = evidence(found)
-        assert co_visible < -0.5 and arrived < -2
+        assert co_visible < 0.5 and arrived < -2
     same = evidence(compare(features(room, 0, 0, 0), features(room, 0.2, 0, 0.1)))
-    assert min(same) > 1
+    assert same[0] > 3 and same[1] > 1
 
 
 def test_plain_pictures_say_nothing(room):
@@ -170,7 +173,7 @@ def test_features_veto_what_the_network_took_for_the_goal(room):
     found = compare(features(room, 0, 0, 0), features(Room(2), 0, 0, 0))
     before = sight(co_visible=0.9, arrived=0.98)
     said = verified(before, found)
-    assert said.arrived < 0.2 and said.co_visible < 0.5
+    assert said.arrived < 0.2 and said.co_visible < 0.65
     assert (said.position == before.position).all() and said.sigma > before.sigma
 
 

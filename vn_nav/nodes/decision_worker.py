@@ -26,7 +26,7 @@ from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.policy.search.local_features import SIDE
-from vn_nav.policy.search.verification import NONE, View
+from vn_nav.policy.search.verification import SIFT, View
 
 WINDOW_S = 5.0  # that rates and latencies are measured over
 # That a picture waits for the ranges measured with it: scanners turn 10 times a second. In
@@ -281,7 +281,7 @@ class DecisionWorker:
 
     def _prepare(self, message) -> tuple[np.ndarray, float, View | None]:
         """A picture for the policy, its zoom, and all of it where the policy verifies."""
-        fov, verifies = self.camera_fov, self._runtime.verify != NONE
+        fov, verifies = self.camera_fov, self._runtime.verify == SIFT
         smallest = needed_side(self._runtime.size, fov, self._runtime.camera_fov)
         whole = images.decode_rgb(message, max(smallest, SIDE) if verifies else smallest)
         view = View(whole, fov or self._runtime.camera_fov) if verifies else None

@@ -29,7 +29,7 @@ PARAMETERS = {
                  ('', 'sample', 'greedy')),
     'stop_threshold': (-1.0, 'probability of arrival above which the robot stands still and says '
                              'so, 0 to 1 (1: never); -1: as the checkpoint says', (-1.0, 1.0)),
-    'verify': (NONE, "none, or sift: what a policy that searches sees of its goal is verified by "
+    'verify': (NONE, 'none, or sift: what a policy that searches sees of its goal is verified by '
                      'local features of the full pictures; for cameras, not simulators', VERIFY),
     'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
     'frame_timeout': (0.25, 'time without pictures after which the robot stands still [s]',

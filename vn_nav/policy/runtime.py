@@ -400,7 +400,9 @@ class BatchedPolicy:
 
 def _search(network: Policy, num_envs: int, pitch: float) -> SearchDriver | None:
     """What decides where the network only sees."""
-    return SearchDriver(network, num_envs, pitch=pitch) if isinstance(network, SearchPolicy) else None
+    if not isinstance(network, SearchPolicy):
+        return None
+    return SearchDriver(network, num_envs, pitch=pitch)
 
 
 def _check_decoding(decoding: str) -> None:

@@ -1,4 +1,4 @@
-"""Local features of full pictures: what two pictures have in common, and how they lie to each other.
+"""Local features of full pictures: what two have in common, and how their cameras stand.
 
 RootSIFT (Lowe 2004; Arandjelovic and Zisserman 2012), mutual best matches with the ratio test, and
 the essential matrix by MAGSAC++ (Barath et al. 2020) with the camera's focal length. For cameras
@@ -41,7 +41,7 @@ class Features(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What two pictures have in common, and the second camera as the robot at the first sees it."""
+    """What two pictures share, and the second camera as the robot at the first sees it."""
 
     rich: bool  # both have features enough for a lack of matches to mean something
     likeness: float  # log of the closeness of mutual best matches, over all features

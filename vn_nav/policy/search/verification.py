@@ -19,9 +19,9 @@ from vn_nav.policy.search.searcher import Sight
 
 NONE, SIFT = VERIFY = 'none', 'sift'
 # Logistic regressions on pairs of simulated pictures, `python bench/local_features.py`.
-CO_VISIBLE = 5.69, 1.32, 3.55  # constant, likeness, that there is a motion
-ARRIVED = -4.79, 0.85  # constant, log(1 + matches)
-ARRIVED_BY_POSE = 4.86, -2.79, -5.24  # where there is a motion: constant, a metre, a radian
+CO_VISIBLE = 7.58, 1.81, 2.43  # constant, likeness, that there is a motion
+ARRIVED = -5.65, 1.04  # constant, log(1 + matches)
+ARRIVED_BY_POSE = 4.65, -2.48, -4.24  # where there is a motion: constant, a metre, a radian
 FAR, TURNED = 3.0, 1.5  # m, rad: beyond, a motion says no more against an arrival
 # Of the network's logit, where there are features: what helps photographs. In simulation, where it
 # has learned, it should count more, and there is nothing to verify.
