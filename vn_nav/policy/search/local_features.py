@@ -79,7 +79,7 @@ def extract(picture: np.ndarray, fov: float, most: int = MOST) -> Features:
         grey, reached = np.ascontiguousarray(grey[part]), np.ascontiguousarray(reached[part])
         corner[:] = columns[0], rows[0]
     detector = cv2.SIFT.create(most, 3, CONTRAST)
-    points, found = detector.detectAndCompute(grey, reached)  # type: ignore[call-overload]
+    points, found = detector.detectAndCompute(grey, reached)
     if not points:
         return _nothing(pixel)
     # OpenCV returns more than were asked for where the last ones are as strong as one another.
