@@ -19,6 +19,10 @@ policy's camera (`CAMERAS`):
 - driving in the graph of the photographs (`vn_sim_bridge.recorded`): the right picture, the wrong
   one, random moves. Success is arrival, by the rule of the image task.
 
+`--told METRES` drives with perfect recognition instead: where the goal stands, the robot is told
+whenever that is so near and within its field of view, walls aside. What is left is planner and
+graph.
+
 With `--verify sift` also of local features of the full photographs, and of network and features
 together, which then drive as well (`vn_nav.policy.search.verification`). `--from K` leaves out the
 first K photographs: settings of the features were chosen on every sixth from the first on.
@@ -41,6 +45,7 @@ from photo_sequence import Camera, Sequence
 
 from vn_nav.arrival import ARRIVAL_RADIUS
 from vn_nav.arrival import arrived as is_arrived
+from vn_nav.co_visibility import relative_pose
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.metrics import summarise
@@ -52,7 +57,7 @@ from vn_nav.learning.sight_figures import (
     angle_between,
     auc,
 )
-from vn_nav.lens import zoom_of
+from vn_nav.lens import squeezed_pose, zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.search.driver import sights_of
 from vn_nav.policy.search.lens import in_metres
@@ -229,8 +234,57 @@ def camera_pitch(sequence: Sequence, wanted: float | None) -> float:
     return float(np.median(sequence.poses[:, 3])) if wanted is None else wanted
 
 
+class Told:
+    """Eyes that see a goal wherever it stands ahead within some metres; ranges as of a network.
+
+    Args:
+        network: in whose place they are.
+        zoom: of the lens, which what they say is squeezed by, see `vn_nav.lens`.
+        metres: how far they see.
+
+    Attributes:
+        truth: [N,4] of the goals as the robots see them, before each look.
+    """
+
+    def __init__(self, network: SearchPolicy, zoom: float, fov: float, metres: float):
+        self.config, self.taught, self._network = network.config, None, network
+        self._zoom, self._fov, self._metres = zoom, fov, metres
+        self.truth = np.zeros((0, 4))
+
+    def look(self, image: torch.Tensor, goal_maps: torch.Tensor) -> Look:
+        """As `SearchPolicy.look`."""
+        x, y = self.truth[:, :2].T
+        gap = np.hypot(x, y)
+        sees = (gap <= self._metres) & ((np.abs(np.arctan2(y, x)) <= self._fov / 2)
+                                        | (gap <= ARRIVAL_RADIUS))
+        said = torch.from_numpy(squeezed_pose(self.truth, np.full(len(x), self._zoom))).float()
+        sure = torch.full((len(x),), 0.1)
+        shown = torch.from_numpy(np.where(sees, 5.0, -3.0)).float()
+        return self._network.look(image, goal_maps)._replace(
+            position=said[:, :2], position_sigma=sure, heading=said[:, 2:], heading_sigma=sure,
+            co_visible=shown, arrived=shown)
+
+
+class ToldActor(evaluator.PolicyActor):
+    """A policy with such eyes."""
+
+    def __init__(self, env, network: SearchPolicy, metres: float):
+        super().__init__(env, network, 'greedy', 0)
+        fov = env.robot.camera_fov
+        self._eyes = Told(network, max(zoom_of(fov, network.config.view), 1.0), fov, metres)
+        assert self.policy.search is not None  # by its architecture
+        self.policy.search.network = self._eyes
+
+    def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
+        """Actions."""
+        self._eyes.truth = relative_pose(self.env.simulator.poses,
+                                         self.env.goal_poses[observation['goal_index']])
+        return super().__call__(observation, reset)
+
+
 def drive(sequence: Sequence, network: SearchPolicy, camera: Camera, told: bool, episodes: int,
-          decisions: int, verify: str = NONE) -> dict[str, dict]:
+          decisions: int, verify: str = NONE, told_metres: float | None = None
+          ) -> dict[str, dict]:
     """Rows of episodes in the graph of the photographs."""
     every = np.arange(len(sequence))
     images = sequence.pictures(camera, network.config.size if verify == NONE else SIDE, every)
@@ -247,6 +301,8 @@ def drive(sequence: Sequence, network: SearchPolicy, camera: Camera, told: bool,
     rows = evaluator.make_actors(env, network, 'greedy', (
         evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST), evaluator.STOP_THRESHOLD, 0,
         verify=verify)
+    if told_metres is not None:
+        rows = {f'told within {told_metres:g} m': (ToldActor(env, network, told_metres), 'right')}
     found = {}
     for name, (actor, shown) in rows.items():
         env.set_shown_goal(shown)
@@ -308,7 +364,7 @@ def run(options: argparse.Namespace) -> None:
     if options.drive:
         camera, told = cameras[options.cameras[0]]
         result['drive'] = drive(sequence, network, camera, told, options.episodes,
-                                options.decisions, options.verify)
+                                options.decisions, options.verify, options.told)
         print(f'\n| driving, {options.cameras[0]}, verify {options.verify} '
               '| success | SPL | decisions |\n|---|---|---|---|')
         for name, row in result['drive'].items():
@@ -329,6 +385,7 @@ def main() -> int:
     parser.add_argument('--every', type=int, default=EVERY, help='photographs: every so many')
     parser.add_argument('--from', type=int, default=0, dest='first', help='the first of them')
     parser.add_argument('--verify', choices=VERIFY, default=NONE)
+    parser.add_argument('--told', type=float, metavar='METRES')
     parser.add_argument('--features', nargs='+', choices=FEATURES, default=(),
                         help='judge local features of the photographs as well')
     parser.add_argument('--no-drive', dest='drive', action='store_false')
