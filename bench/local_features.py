@@ -132,7 +132,7 @@ def _degrees(angles: np.ndarray) -> float:
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
-    parser.add_argument('--pairs', type=int, default=600, help='for each lens')
+    parser.add_argument('--pairs', type=int, default=240, help='for each lens')
     options = parser.parse_args()
     cv2.setNumThreads(1)
     pairs = compared(TRAIN, options.pairs)
