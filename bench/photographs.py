@@ -4,6 +4,7 @@
     python bench/photographs.py FOLDER --cameras known width level grey --no-drive
     python bench/photographs.py FOLDER --episodes 60 --json photographs.json
     python bench/photographs.py FOLDER --features sift xfeat --no-drive --every 6
+    python bench/photographs.py FOLDER --verify sift --every 6
 
 The folder is described in `photo_sequence.py`. Reports, for each way to take a photograph for the
 policy's camera (`CAMERAS`):
@@ -17,6 +18,14 @@ policy's camera (`CAMERAS`):
   of all other stretches truly overlap;
 - driving in the graph of the photographs (`vn_sim_bridge.recorded`): the right picture, the wrong
   one, random moves. Success is arrival, by the rule of the image task.
+
+`--told METRES` drives with perfect recognition instead: where the goal stands, the robot is told
+whenever that is so near and within its field of view, walls aside. What is left is planner and
+graph.
+
+With `--verify sift` also of local features of the full photographs, and of network and features
+together, which then drive as well (`vn_nav.policy.search.verification`). `--from K` leaves out the
+first K photographs: settings of the features were chosen on every sixth from the first on.
 """
 
 from __future__ import annotations
@@ -36,6 +45,7 @@ from photo_sequence import Camera, Sequence
 
 from vn_nav.arrival import ARRIVAL_RADIUS
 from vn_nav.arrival import arrived as is_arrived
+from vn_nav.co_visibility import relative_pose
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.metrics import summarise
@@ -47,11 +57,14 @@ from vn_nav.learning.sight_figures import (
     angle_between,
     auc,
 )
-from vn_nav.lens import zoom_of
+from vn_nav.lens import squeezed_pose, zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.policy.search.driver import sights_of
 from vn_nav.policy.search.lens import in_metres
+from vn_nav.policy.search.local_features import SIDE, compare, extract
 from vn_nav.policy.search.look import BINS, COLUMNS, Look, column_bearings
 from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
+from vn_nav.policy.search.verification import NONE, VERIFY, evidence, verified
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.recorded.image_graph import build_graph
@@ -63,9 +76,9 @@ STRETCHES = 10
 BATCH = 1000  # pairs
 NEAR = 0.3  # m: nearer, a bearing means nothing
 SURE = 30  # matches
-FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'bearing_deg',
-           'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'sure', 'sure_far',
-           'recognised', 'recognisable')
+FIGURES = ('auc', *(f'auc_{band}' for band in BANDS), 'called', 'called_apart', 'posed',
+           'bearing_deg', 'heading_deg', 'position_m', 'arrived_auc', 'arrived_ring_auc', 'sure',
+           'sure_far', 'recognised', 'recognisable')
 
 
 class Pairs(NamedTuple):
@@ -79,14 +92,14 @@ class Pairs(NamedTuple):
     truth: np.ndarray  # [P,4] as of `relative_pose`
 
 
-def pairs_of(sequence: Sequence, every: int) -> Pairs:
+def pairs_of(sequence: Sequence, every: int, first: int = 0) -> Pairs:
     """All pairs of some of a sequence."""
-    chosen = np.arange(0, len(sequence), every)
+    chosen = np.arange(first, len(sequence), every)
     overlap = sequence.overlaps(chosen)
-    first, second = np.nonzero(~np.eye(len(chosen), dtype=bool))
-    own, back = overlap[first, second], overlap[second, first]
-    return Pairs(chosen, first, second, own, (own == 0) & (back == 0),
-                 sequence.relative(chosen[first], chosen[second]))
+    one, other = np.nonzero(~np.eye(len(chosen), dtype=bool))
+    own, back = overlap[one, other], overlap[other, one]
+    return Pairs(chosen, one, other, own, (own == 0) & (back == 0),
+                 sequence.relative(chosen[one], chosen[other]))
 
 
 def cameras_of(sequence: Sequence) -> dict[str, tuple[Camera, bool]]:
@@ -134,7 +147,7 @@ def judge(pairs: Pairs, score: np.ndarray, position: np.ndarray | None = None,
 
     Args:
         pairs: the pairs; score: [P].
-        position, heading: [P,2] of the second in the frame of the first.
+        position, heading: [P,2] of the second in the frame of the first; nan: not known.
         called: [P] bool: whether they are said to overlap.
         arrived: [P] score of having arrived; None: that of the overlap.
     """
@@ -150,6 +163,9 @@ def judge(pairs: Pairs, score: np.ndarray, position: np.ndarray | None = None,
         found |= {'called': float(called[sees].mean()),
                   'called_apart': float(called[pairs.apart].mean())}
     if position is not None and heading is not None:
+        posed = np.isfinite(position[:, 0])
+        found['posed'] = float(posed[sees].mean())
+        sees &= posed
         far = sees & (np.hypot(*pairs.truth[:, :2].T) > NEAR)
         gap = np.hypot(*(position - pairs.truth[:, :2])[sees].T)
         found |= {
@@ -193,12 +209,86 @@ def recognition(pairs: Pairs, score: np.ndarray) -> dict[str, float]:
     return {'recognised': float(right.mean()), 'recognisable': float(can.mean())}
 
 
+def judge_verified(sequence: Sequence, pairs: Pairs, said: Look) -> dict[str, dict[str, float]]:
+    """Rows of local features alone, and of what the network says with them."""
+    pitch = camera_pitch(sequence, None)
+    features = [extract(sequence.images[k], sequence.upright_fov) for k in pairs.chosen]
+    found = [compare(features[one], features[other], pitch)
+             for one, other in zip(pairs.first, pairs.second, strict=True)]
+    logits = np.array([evidence(own) for own in found])
+    turns = np.array([own.heading for own in found])
+    rows = {'features alone': judge(
+        pairs, logits[:, 0], np.array([own.position for own in found]),
+        np.column_stack([np.cos(turns), np.sin(turns)]), logits[:, 0] > 0, logits[:, 1])}
+    both = [verified(sight, own) for sight, own in zip(sights_of(said), found, strict=True)]
+    shown = np.array([sight.co_visible for sight in both])
+    rows['verified'] = judge(
+        pairs, shown, np.array([sight.position for sight in both]),
+        np.array([sight.heading for sight in both]), shown > 0.5,
+        np.array([sight.arrived for sight in both]))
+    return rows
+
+
+def camera_pitch(sequence: Sequence, wanted: float | None) -> float:
+    """Of the camera of a robot that took the sequence [rad down]."""
+    return float(np.median(sequence.poses[:, 3])) if wanted is None else wanted
+
+
+class Told:
+    """Eyes that see a goal wherever it stands ahead within some metres; ranges as of a network.
+
+    Args:
+        network: in whose place they are.
+        zoom: of the lens, which what they say is squeezed by, see `vn_nav.lens`.
+        metres: how far they see.
+
+    Attributes:
+        truth: [N,4] of the goals as the robots see them, before each look.
+    """
+
+    def __init__(self, network: SearchPolicy, zoom: float, fov: float, metres: float):
+        self.config, self.taught, self._network = network.config, None, network
+        self._zoom, self._fov, self._metres = zoom, fov, metres
+        self.truth = np.zeros((0, 4))
+
+    def look(self, image: torch.Tensor, goal_maps: torch.Tensor) -> Look:
+        """As `SearchPolicy.look`."""
+        x, y = self.truth[:, :2].T
+        gap = np.hypot(x, y)
+        sees = (gap <= self._metres) & ((np.abs(np.arctan2(y, x)) <= self._fov / 2)
+                                        | (gap <= ARRIVAL_RADIUS))
+        said = torch.from_numpy(squeezed_pose(self.truth, np.full(len(x), self._zoom))).float()
+        sure = torch.full((len(x),), 0.1)
+        shown = torch.from_numpy(np.where(sees, 5.0, -3.0)).float()
+        return self._network.look(image, goal_maps)._replace(
+            position=said[:, :2], position_sigma=sure, heading=said[:, 2:], heading_sigma=sure,
+            co_visible=shown, arrived=shown)
+
+
+class ToldActor(evaluator.PolicyActor):
+    """A policy with such eyes."""
+
+    def __init__(self, env, network: SearchPolicy, metres: float):
+        super().__init__(env, network, 'greedy', 0)
+        fov = env.robot.camera_fov
+        self._eyes = Told(network, max(zoom_of(fov, network.config.view), 1.0), fov, metres)
+        assert self.policy.search is not None  # by its architecture
+        self.policy.search.network = self._eyes
+
+    def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
+        """Actions."""
+        self._eyes.truth = relative_pose(self.env.simulator.poses,
+                                         self.env.goal_poses[observation['goal_index']])
+        return super().__call__(observation, reset)
+
+
 def drive(sequence: Sequence, network: SearchPolicy, camera: Camera, told: bool, episodes: int,
-          decisions: int) -> dict[str, dict]:
+          decisions: int, verify: str = NONE, told_metres: float | None = None
+          ) -> dict[str, dict]:
     """Rows of episodes in the graph of the photographs."""
     every = np.arange(len(sequence))
-    images = sequence.pictures(camera, network.config.size, every)
-    pitch = float(np.median(sequence.poses[:, 3])) if camera.pitch is None else camera.pitch
+    images = sequence.pictures(camera, network.config.size if verify == NONE else SIDE, every)
+    pitch = camera_pitch(sequence, camera.pitch)
     spec = RobotSpec()
     robot = dataclasses.replace(spec, camera_fov=camera.fov if told else network.config.view,
                                 camera_pitch=pitch).with_actions(network.config.actions)
@@ -209,7 +299,10 @@ def drive(sequence: Sequence, network: SearchPolicy, camera: Camera, told: bool,
     env = make_env(graph, robot, min(episodes, evaluator.ENVIRONMENTS), stop=evaluator.ARRIVAL,
                    max_decisions=decisions, odometry='drift')
     rows = evaluator.make_actors(env, network, 'greedy', (
-        evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST), evaluator.STOP_THRESHOLD, 0)
+        evaluator.WRONG, evaluator.RANDOM, evaluator.SHORTEST), evaluator.STOP_THRESHOLD, 0,
+        verify=verify)
+    if told_metres is not None:
+        rows = {f'told within {told_metres:g} m': (ToldActor(env, network, told_metres), 'right')}
     found = {}
     for name, (actor, shown) in rows.items():
         env.set_shown_goal(shown)
@@ -245,7 +338,7 @@ def run(options: argparse.Namespace) -> None:
     for name in options.cameras:
         if name not in cameras:
             raise UserError(f'a camera is one of {", ".join(cameras)}', name, 'choose some')
-    pairs = pairs_of(sequence, options.every)
+    pairs = pairs_of(sequence, options.every, options.first)
     seen = pairs.overlap >= POSE_OVERLAP
     print(f'{len(sequence)} photographs, {math.degrees(sequence.fov):.0f} x '
           f'{math.degrees(sequence.upright_fov):.0f} deg; {len(pairs.first):,} pairs, '
@@ -259,6 +352,9 @@ def run(options: argparse.Namespace) -> None:
         rows[name] = judge(pairs, said.co_visible.numpy(), said.position.numpy(),
                            said.heading.numpy(), said.co_visible.numpy() > 0,
                            said.arrived.numpy())
+        if options.verify != NONE:
+            rows |= {f'{name}, {title}': row
+                     for title, row in judge_verified(sequence, pairs, said).items()}
     for name in options.features:
         for kind, counts in matched(name, sequence, pairs.chosen).items():
             score = counts[pairs.first, pairs.second]
@@ -268,9 +364,9 @@ def run(options: argparse.Namespace) -> None:
     if options.drive:
         camera, told = cameras[options.cameras[0]]
         result['drive'] = drive(sequence, network, camera, told, options.episodes,
-                                options.decisions)
-        print(f'\n| driving, {options.cameras[0]} | success | SPL | decisions |\n'
-              '|---|---|---|---|')
+                                options.decisions, options.verify, options.told)
+        print(f'\n| driving, {options.cameras[0]}, verify {options.verify} '
+              '| success | SPL | decisions |\n|---|---|---|---|')
         for name, row in result['drive'].items():
             print(f'| {name} | {row["success"]:.2f} | {row["spl"]:.2f} | {row["decisions"]:.0f} |')
     text = json.dumps(result)
@@ -287,6 +383,9 @@ def main() -> int:
     parser.add_argument('--cameras', nargs='+', default=['width'], metavar='CAMERA',
                         help='the first one drives')
     parser.add_argument('--every', type=int, default=EVERY, help='photographs: every so many')
+    parser.add_argument('--from', type=int, default=0, dest='first', help='the first of them')
+    parser.add_argument('--verify', choices=VERIFY, default=NONE)
+    parser.add_argument('--told', type=float, metavar='METRES')
     parser.add_argument('--features', nargs='+', choices=FEATURES, default=(),
                         help='judge local features of the photographs as well')
     parser.add_argument('--no-drive', dest='drive', action='store_false')

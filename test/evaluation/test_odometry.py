@@ -15,6 +15,8 @@ from vn_nav.evaluation.measurement import odometry_for
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.policy.search.driver import SearchDriver
+from vn_nav.policy.search.local_features import SIDE, extract
 from vn_nav.policy.search.searcher import Searcher
 from vn_nav.resources import share_file
 
@@ -89,6 +91,25 @@ def test_a_map_takes_the_ranges_that_are_measured(monkeypatch):
         else:
             assert [np.array_equal(scan.ranges, row) and scan.scanner is env.scanner
                     for scan, row in zip(seen, observation['scan'], strict=True)] == [True] * 2
+
+
+def test_a_robot_verifies_by_pictures_larger_than_the_networks(monkeypatch):
+    checkpoint = load_checkpoint(share_file('models/search'))
+    shown, act = [], SearchDriver.act
+    monkeypatch.setattr(SearchDriver, 'act', lambda self, *given: (
+        shown.append((given[0], given[-1])), act(self, *given))[1])
+    env = make_env_for(checkpoint, ['house:7'], 2, stop='declared', own=False, smallest=SIDE)
+    observation, info = env.reset(seed=0)
+    assert observation['image'].shape[-1] == SIDE
+    PolicyActor(env, checkpoint.network, 'greedy', 0, verify='sift')(observation, info['reset'])
+    image, pairs = shown[-1]
+    assert image.shape[-1] == checkpoint.config.size
+    assert all(len(pair.own.rays) > 20 for pair in pairs)
+    own = extract(observation['image'][1].transpose(1, 2, 0), env.robot.camera_fov)
+    assert np.array_equal(pairs[1].own.descriptors, own.descriptors)
+    goal = extract(env.goals[observation['goal_index'][1]].transpose(1, 2, 0),
+                   env.robot.camera_fov)
+    assert np.array_equal(pairs[1].goal.rays, goal.rays)
 
 
 def test_ranges_are_for_policies_with_a_map(folder, tmp_path, capsys):

@@ -39,9 +39,9 @@ class Recording(PolicyRuntime):
         super().__init__(checkpoint)
         self.poses, self.breaks = [], 0
 
-    def act(self, image, odometry=None, scan=None, zoom=1.0):
+    def act(self, image, odometry=None, scan=None, zoom=1.0, view=None):
         self.poses.append(odometry)
-        return super().act(image, odometry, scan, zoom)
+        return super().act(image, odometry, scan, zoom, view)
 
     def reset_odometry(self):
         self.breaks += 1
@@ -174,9 +174,9 @@ def test_in_a_shadow_who_says_what_was_done_may_say_where(inside):
 TELLS = """
 from vn_nav.policy.runtime import PolicyRuntime
 act = PolicyRuntime.act
-def telling(self, image, odometry=None, scan=None, zoom=1.0):
+def telling(self, image, odometry=None, scan=None, zoom=1.0, view=None):
     print('pose', None if odometry is None else odometry.tolist(), flush=True)
-    return act(self, image, odometry, scan, zoom)
+    return act(self, image, odometry, scan, zoom, view)
 PolicyRuntime.act = telling
 """
 

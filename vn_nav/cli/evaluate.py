@@ -27,6 +27,9 @@ from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.measurement import EvaluateConfig, evaluate, odometry_for, ranges_for
 from vn_nav.files import write_file
 from vn_nav.learning.teach_evaluation import DRIVE_SPLITS
+from vn_nav.policy.network_config import SEARCH
+from vn_nav.policy.search.local_features import SIDE
+from vn_nav.policy.search.verification import NONE, VERIFY, check_verify
 from vn_nav.report import tables
 from vn_nav.report.evaluation_page import evaluation_page
 from vn_nav.robot import load_robot
@@ -66,6 +69,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help='that the map of a policy which searches is given: what its network '
                         'sees in the picture, a laser scan all around, or a depth picture '
                         '(default: picture)')
+    parser.add_argument('--verify', choices=VERIFY, default=NONE, help='by what the sight of a '
+                        'policy which searches is verified: local features of pictures of '
+                        f'{SIDE} pixels, which its network is shown shrunk (default: none)')
     parser.add_argument('--stop', choices=evaluator.STOPS, help='what ends the episodes: '
                         'arriving, or that the policy says so (default: both, apart)')
     parser.add_argument('--no-controls', action='store_true')
@@ -83,12 +89,14 @@ def run(args: argparse.Namespace) -> int:
         episodes=args.episodes, seed=args.seed, decoding=args.decoding,
         controls=() if args.no_controls else evaluator.CONTROLS,
         stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None,
-        stops=(args.stop,) if args.stop else evaluator.STOPS)
+        stops=(args.stop,) if args.stop else evaluator.STOPS, verify=args.verify)
     # Pictures of a drive were taken with its own camera.
     checkpoint, robot = load_for(args.checkpoint, args.robot, any_camera=args.bag is None)
     odometry = odometry_for(checkpoint.network, args.odometry)
     ranges = ranges_for(checkpoint.network, args.ranges)
+    check_verify(args.verify, checkpoint.config.architecture == SEARCH)
     measured_by = '' if ranges == 'picture' else f', ranges: {ranges}'
+    measured_by += '' if args.verify == NONE else f', verify: {args.verify}'
     bag = args.bag.name if args.bag else None
 
     def show(name: str, result: dict) -> None:
@@ -148,6 +156,10 @@ def _check_drive(args: argparse.Namespace) -> None:
     if args.ranges not in (None, 'picture'):
         raise UserError('nobody measures ranges in the pictures of a recorded drive',
                         f'--ranges {args.ranges} together with --bag', 'leave one of them out')
+    if args.verify != NONE:
+        raise UserError("local features are of full pictures; of a recorded drive the policy's "
+                        'own are kept', f'--verify {args.verify} together with --bag',
+                        'leave one of them out')
     for name in args.split or ():
         if name not in DRIVE_SPLITS:
             raise UserError(f'goals of a drive are divided into {" and ".join(DRIVE_SPLITS)}',
@@ -207,7 +219,7 @@ def _scenes(args: argparse.Namespace, checkpoint, odometry: str) -> tuple[dict, 
             own=set(splits[split]) <= set(checkpoint.info['scenes']),
             randomisation=args.randomisation, max_decisions=args.max_decisions,
             goal_seed=UNSEEN_GOALS if split == 'unseen_goals' else 0, odometry=odometry,
-            ranges=args.ranges, say=say)
+            ranges=args.ranges, smallest=0 if args.verify == NONE else SIDE, say=say)
     return splits, make
 
 

@@ -90,7 +90,7 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
 def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                  robot: Path | None = None, randomisation: str | None = None,
                  max_decisions: int = 300, goal_seed: int = 0, odometry: str | None = None,
-                 size: int | None = None,
+                 size: int | None = None, smallest: int = 0,
                  ranges: str | None = None, privileged: Collection[str] = (),
                  say: Callable[[str], None] = SAY):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
@@ -105,6 +105,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         goal_seed: 0 for the goals of the training.
         odometry: that the policy is given; None: see `measurement.odometry_for`.
         size: side of the pictures [pixels]; None: what the policy needs.
+        smallest: side that they have at least, where more than the network looks at them.
         ranges: that its map is given; None: see `measurement.ranges_for`.
         privileged: what it tells beside the observations, to who measures.
         say: receives a line about what the simulator cannot vary.
@@ -122,7 +123,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         if robot is not None:  # which may have another camera: see `PolicyActor`
             size = needed_side(size, load_robot(robot).camera_fov,
                                math.radians(info['camera_fov_deg']))
-    env = make_env(scenes, envs, robot=robot, size=size,
+    env = make_env(scenes, envs, robot=robot, size=max(size, smallest),
                    randomisation=randomisation or info['randomisation'], task=info['task'],
                    objects=info['objects'], actions=checkpoint.config.actions,
                    max_decisions=max_decisions, stop=stop, goal_seed=goal_seed,

@@ -15,6 +15,7 @@ from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.search.snapshot import Snapshot, snapshot
+from vn_nav.policy.search.verification import NONE
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
 from vn_nav.vector_env import ExploringEnv, MeasuredVectorEnv
@@ -136,6 +137,7 @@ class PolicyActor:
         known: scenes that it was trained in, for a network with layers for several scenes.
         camera_fov: field of view that it was trained with [rad]; None: that of the robots. Larger
             pictures of a robot with another one are made its own, as `policy_node` does.
+        verify: see `PolicyRuntime`; the network is shown the robots' pictures shrunk.
 
     Attributes:
         filtered: [2,N] bool: where the action filter acted on the last actions, and where it
@@ -144,16 +146,18 @@ class PolicyActor:
 
     def __init__(self, env: MeasuredVectorEnv, network: Policy, decoding: str, seed: int,
                  threshold: float = STOP_THRESHOLD, known: Sequence[str] = (),
-                 camera_fov: float | None = None):
+                 camera_fov: float | None = None, verify: str = NONE):
         self.env, self.threshold = env, threshold
         self._size, self._camera_fov = network.config.size, camera_fov
+        self._verifies = verify != NONE
         self._goals: tuple[np.ndarray, np.ndarray] | None = None  # the robots', and the network's
         self.known = known if network.config.scenes > 1 else ()
         self.policy = BatchedPolicy(
             network, env.num_envs, decoding=decoding, seed=seed,
             scanner=getattr(env, 'scanner', None),
             zoom=(max(zoom_of(env.robot.camera_fov, network.config.view), 1.0)
-                  if network.config.architecture == SEARCH else 1.0))
+                  if network.config.architecture == SEARCH else 1.0),
+            verify=verify, camera_fov=env.robot.camera_fov, camera_pitch=env.robot.camera_pitch)
         self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
@@ -161,6 +165,7 @@ class PolicyActor:
         if self.known:
             scene = scene_numbers([self.env.places[place].name for place in self.env.place_index],
                                   self.known)
+        full = observation['image'], self.env.goals
         observation = {**observation, 'image': self._own(observation['image'])}
         if self._goals is None or self._goals[0] is not self.env.goals:
             self._goals = self.env.goals, self._own(self.env.goals)
@@ -168,7 +173,7 @@ class PolicyActor:
         known = getattr(self.env, 'goal_features', None)
         if known is not None and self.policy.takes_features(known.shape[-1]):
             goals = known
-        actions = self.policy.act(observation, goals, reset, scene)
+        actions = self.policy.act(observation, goals, reset, scene, full)
         declares = np.zeros(len(actions), bool)
         declare = self.env.declare_action
         if declare is not None:
@@ -187,17 +192,23 @@ class PolicyActor:
         """Pictures [K,3,H,H] of the robots' cameras as the network takes them."""
         if self._camera_fov is None or (
                 self.env.robot.camera_fov <= (1 + SAME_FOV) * self._camera_fov):
-            return pictures
+            return self._shrunk(pictures)
         fov = self.env.robot.camera_fov
         return np.stack([preprocess(picture.transpose(1, 2, 0), self._size, fov=fov,
                                     target_fov=self._camera_fov) for picture in pictures])
+
+    def _shrunk(self, pictures: np.ndarray) -> np.ndarray:
+        if not self._verifies or pictures.shape[-1] == self._size:
+            return pictures
+        return np.stack([preprocess(picture.transpose(1, 2, 0), self._size)
+                         for picture in pictures])
 
 
 def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decoding: str,
             episodes: int = 100, controls: Sequence[str] = CONTROLS,
             threshold: float | None = None, seed: int = 10_000, known: Sequence[str] = (),
             robot: RobotSpec | None = None, camera_fov: float | None = None,
-            stops: Sequence[str] = STOPS, own: bool = True) -> Rows:
+            stops: Sequence[str] = STOPS, own: bool = True, verify: str = NONE) -> Rows:
     """Episodes of a policy and of its controls, the same number in each scene.
 
     A network that can declare its stop is measured a second time, with declared stops.
@@ -217,6 +228,7 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
         camera_fov: see `PolicyActor`.
         stops: which of `STOPS`.
         own: the policy itself drives to its goals; else the controls alone.
+        verify: see `PolicyActor`.
 
     Returns:
         By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
@@ -237,7 +249,7 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
                 continue
             with contextlib.closing(make_env(part, environments, stop)) as env:
                 actors = make_actors(env, network, decoding, controls, threshold, seed + chunk,
-                                     known, camera_fov, own)
+                                     known, camera_fov, own, verify)
                 for name, (actor, shown) in actors.items():
                     env.set_shown_goal(shown)
                     rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
@@ -266,13 +278,13 @@ def parts_of(scenes: Sequence[str], episodes: int) -> list[tuple[list[str], int,
 
 def make_actors(env, network: Policy, decoding: str, controls: Sequence[str], threshold: float,
                 seed: int, known: Sequence[str] = (), camera_fov: float | None = None,
-                own: bool = True) -> dict[str, tuple[Actor, str]]:
+                own: bool = True, verify: str = NONE) -> dict[str, tuple[Actor, str]]:
     """Who drives in each row, and which goal picture it is shown; the policy itself first.
 
     Args: see `measure`.
     """
     def policy(rule: str = decoding) -> Actor:
-        return PolicyActor(env, network, rule, seed, threshold, known, camera_fov)
+        return PolicyActor(env, network, rule, seed, threshold, known, camera_fov, verify)
 
     rows: dict[str, tuple[Actor, str]] = {}
     if own:

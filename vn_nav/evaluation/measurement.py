@@ -14,6 +14,7 @@ from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
+from vn_nav.policy.search.verification import NONE, check_verify
 from vn_nav.robot import RobotSpec
 
 
@@ -34,6 +35,7 @@ class EvaluateConfig:
     robot: RobotSpec | None = None  # for durations; None: the scenes' own
     stops: tuple[str, ...] = evaluator.STOPS  # what ends the episodes
     policy: bool = True  # the policy itself drives to its goals; else the controls alone
+    verify: str = NONE  # see `vn_nav.policy.search.verification`
 
     def __post_init__(self):
         threshold = self.stop_threshold
@@ -72,7 +74,7 @@ class Evaluation:
 
 def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions: int,
                decoding: str, seed: int, odometry: str, ranges: str = 'picture',
-               camera: str | None = None) -> dict:
+               camera: str | None = None, verify: str = NONE) -> dict:
     """A result without splits: what all of them have in common.
 
     Args:
@@ -86,13 +88,15 @@ def new_result(info: Mapping, *, checkpoint: str, bag: str | None, max_decisions
         odometry: that the policy was given: true, drift, commanded, or none.
         ranges: that its map was given: picture, scan or depth.
         camera: of the robots, in words; None: the one that the policy was trained with.
+        verify: see `vn_nav.policy.search.verification`; said only where something verifies.
     """
     return {'checkpoint': checkpoint,
             **({'sha256': info['sha256']} if 'sha256' in info else {}),
             'bag': bag, 'simulator': info['simulator'],
             'world_version': info['world_version'], 'task': info['task'],
             'decoding': decoding, 'max_decisions': max_decisions, 'seed': seed,
-            'odometry': odometry, 'ranges': ranges, 'camera': camera or camera_name(
+            'odometry': odometry, 'ranges': ranges,
+            **({} if verify == NONE else {'verify': verify}), 'camera': camera or camera_name(
                 info['camera_fov_deg'], info['camera_height']),
             'date': datetime.date.today().isoformat(), 'splits': {}}
 
@@ -162,7 +166,7 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
         make, checkpoint.network, scenes, known=info['scenes'],
         decoding=config.decoding or info['decoding'], episodes=config.episodes,
         controls=controls, seed=config.seed, robot=config.robot, stops=config.stops,
-        own=config.policy,
+        own=config.policy, verify=config.verify,
         camera_fov=math.radians(info['camera_fov_deg']),
         threshold=(info.get('stop_threshold') if config.stop_threshold is None
                    else config.stop_threshold))
@@ -188,6 +192,7 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
         UserError: no split.
     """
     config = config or EvaluateConfig()
+    check_verify(config.verify, checkpoint.config.architecture == SEARCH)
     if not splits:
         raise UserError('there is a split to measure in', dict(splits), 'name one')
     done = Evaluation({}, {}, {})
@@ -213,7 +218,7 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
             {**checkpoint.info, **world}, checkpoint=name, bag=bag,
             max_decisions=configs[0].max_decisions, odometry=configs[0].odometry,
             ranges=configs[0].ranges,
-            camera=cameras[0],
+            camera=cameras[0], verify=config.verify,
             decoding=config.decoding or checkpoint.info['decoding'], seed=config.seed)
         done.result['splits'][split] = evaluator.split_figures(measured, scenes)
         on_split(split, done.result)

@@ -25,6 +25,8 @@ from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
+from vn_nav.policy.search.local_features import SIDE
+from vn_nav.policy.search.verification import SIFT, View
 
 WINDOW_S = 5.0  # that rates and latencies are measured over
 # That a picture waits for the ranges measured with it: scanners turn 10 times a second. In
@@ -188,7 +190,8 @@ class DecisionWorker:
         found = prepared(self._prepare, message, self._wake, self._refuse_goal)
         if found is None:
             return
-        self._runtime.set_goal(found[0])
+        picture, _, view = found
+        self._runtime.set_goal(picture, view)
         with self._wake:
             if self._goal is None:  # else a newer one is waiting
                 stamp = message.header.stamp
@@ -205,7 +208,7 @@ class DecisionWorker:
                          lambda why: self._navigator.bad_frame(why, time.monotonic()))
         if found is None:
             return
-        picture, zoom = found
+        picture, zoom, view = found
         with self._wake:
             now = time.monotonic()
             self._navigator.good_frame(received)
@@ -231,7 +234,7 @@ class DecisionWorker:
             self._runtime.reset_odometry()
         scan = None if self._ranges is None else self._ranges.scan_at(stamp)
         try:
-            action = self._runtime.act(picture, pose, scan, zoom)
+            action = self._runtime.act(picture, pose, scan, zoom, view)
         except FloatingPointError as error:
             with self._wake:
                 self._navigator.stop(str(error), time.monotonic())
@@ -276,7 +279,10 @@ class DecisionWorker:
         self._waits_from = None
         return True
 
-    def _prepare(self, message) -> tuple[np.ndarray, float]:
-        fov = self.camera_fov
+    def _prepare(self, message) -> tuple[np.ndarray, float, View | None]:
+        """A picture for the policy, its zoom, and all of it where the policy verifies."""
+        fov, verifies = self.camera_fov, self._runtime.verify == SIFT
         smallest = needed_side(self._runtime.size, fov, self._runtime.camera_fov)
-        return self._runtime.prepare(images.decode_rgb(message, smallest), fov)
+        whole = images.decode_rgb(message, max(smallest, SIDE) if verifies else smallest)
+        view = View(whole, fov or self._runtime.camera_fov) if verifies else None
+        return *self._runtime.prepare(whole, fov), view

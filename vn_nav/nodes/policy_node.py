@@ -103,7 +103,8 @@ class PolicyNode(LifecycleNode):
         threshold = value['stop_threshold']
         runtime = PolicyRuntime(value['checkpoint'] or share_file('models/house'),
                                 seed=value['seed'], decoding=value['decoding'] or None,
-                                stop_threshold=None if threshold < 0 else threshold)
+                                stop_threshold=None if threshold < 0 else threshold,
+                                verify=value['verify'], camera_pitch=robot.camera_pitch)
         robot = robot.with_actions(runtime.action_names, runtime.moves)
         source.check_policy(searches=runtime.search is not None)
         shadow = value['mode'] == 'shadow'

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from vn_nav.errors import UserError
 from vn_nav.nodes import parameters
+from vn_nav.policy.search.verification import NONE, VERIFY
 
 # The watchdog's limits in lock-step, of wall time.
 LOCK_STEP_LIMIT_S = 2.0
@@ -28,6 +29,8 @@ PARAMETERS = {
                  ('', 'sample', 'greedy')),
     'stop_threshold': (-1.0, 'probability of arrival above which the robot stands still and says '
                              'so, 0 to 1 (1: never); -1: as the checkpoint says', (-1.0, 1.0)),
+    'verify': (NONE, 'none, or sift: what a policy that searches sees of its goal is verified by '
+                     'local features of the full pictures; for cameras, not simulators', VERIFY),
     'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
     'frame_timeout': (0.25, 'time without pictures after which the robot stands still [s]',
                       (0.05, 5.0)),

@@ -26,7 +26,9 @@ from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.search.driver import SearchDriver
+from vn_nav.policy.search.local_features import Features
 from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.verification import NONE, FeaturePairs, Pair, View, check_verify
 from vn_nav.policy.zhu import check_scenes
 from vn_nav.policy.zhu_policy import ScenePolicy
 
@@ -80,6 +82,9 @@ class PolicyRuntime:
         decoding: 'sample' or 'greedy'; left out, the rule of the checkpoint's figures.
         stop_threshold: probability of arrival above which the policy declares its stop, 0 to 1
             (1: never); left out, the checkpoint's.
+        verify: 'sift': what a policy that searches sees of its goal is verified by local features
+            of the full pictures, see `vn_nav.policy.search.verification`; 'none'.
+        camera_pitch: down, of the camera [rad]; for `verify` alone.
 
     Attributes:
         size: side of the square pictures [pixels].
@@ -96,17 +101,22 @@ class PolicyRuntime:
 
     Raises:
         UserError: see `load_checkpoint`; an unknown decoding; a threshold out of range, or one
-            for a network without the head `arrival`.
+            for a network without the head `arrival`; an unknown `verify`, or one for a policy
+            that does not search.
     """
 
     def __init__(self, folder: str | Path, *, seed: int = 0, decoding: str | None = None,
-                 stop_threshold: float | None = None):
+                 stop_threshold: float | None = None, verify: str = NONE,
+                 camera_pitch: float = 0.0):
         checkpoint = load_checkpoint(folder)
         self.decoding = checkpoint.info['decoding'] if decoding is None else decoding
         _check_decoding(self.decoding)
         self.stop_threshold: float | None = (
             checkpoint.info['stop_threshold'] if stop_threshold is None else stop_threshold)
         _check_stop_threshold(self.stop_threshold, checkpoint.config)
+        check_verify(verify, isinstance(checkpoint.network, SearchPolicy))
+        self.verify = verify
+        self._goal_features: Features | None = None
         self.arrival = math.nan
         torch.set_num_threads(1)
         self.size: int = checkpoint.config.size
@@ -121,12 +131,18 @@ class PolicyRuntime:
         self.action_filter: str = checkpoint.config.filter_name
         self.filter_counts = FilterCounts()
         self._filter = make_filter(self.action_filter, self.moves, 1)
-        self.search = _search(self._network, 1)
+        self.search = _search(self._network, 1, camera_pitch)
         self.reset()
 
     @torch.inference_mode()
-    def set_goal(self, goal: np.ndarray) -> None:
-        """Take a goal picture, uint8 [3,S,S], encode it once, and begin an episode."""
+    def set_goal(self, goal: np.ndarray, view: View | None = None) -> None:
+        """Take a goal picture, uint8 [3,S,S], encode it once, and begin an episode.
+
+        Args:
+            goal: the picture; view: the same in full, for `verify`.
+        """
+        self._goal_features = (None if view is None or self.verify == NONE
+                               else view.features())
         self._goal_maps = self._network.encode_goals(self._tensor(goal)[None])
         if self.search is not None:
             self.search.prepare(self._goal_maps)
@@ -199,7 +215,7 @@ class PolicyRuntime:
 
     @torch.inference_mode()
     def act(self, image: np.ndarray, odometry: np.ndarray | None = None,
-            scan: Scan | None = None, zoom: float = 1.0) -> int:
+            scan: Scan | None = None, zoom: float = 1.0, view: View | None = None) -> int:
         """The next action for a picture; remembered as the last action.
 
         Where the policy declares that it has `arrived` the action is not for driving: the episode
@@ -214,6 +230,7 @@ class PolicyRuntime:
             scan: ranges that were measured there, which its map takes in place of those that it
                 sees in the picture. None: there are none at this picture.
             zoom: of picture and goal, as `prepare` says.
+            view: the picture in full, for `verify`; None: nothing is verified at this one.
 
         Raises:
             FloatingPointError: the outputs are not finite; memory and last action stay.
@@ -226,7 +243,7 @@ class PolicyRuntime:
             raise UserError('a goal picture is set before the policy acts', None, 'call set_goal')
         picture, last = self._tensor(image)[None], torch.tensor([self._last_action])
         if self.search is not None:
-            return self._search_on(picture, odometry, scan, zoom)
+            return self._search_on(picture, odometry, scan, zoom, view)
         observation = Observation(picture[None], None, None, last[None], self._reward)
         starts = last[None] < 0
         output, state = self._network(observation, starts, self._state, self._goal_maps)
@@ -249,13 +266,15 @@ class PolicyRuntime:
         return action
 
     def _search_on(self, picture: torch.Tensor, odometry: np.ndarray | None, scan: Scan | None,
-                   zoom: float) -> int:
+                   zoom: float, view: View | None) -> int:
         """`act` of a policy that searches."""
         assert self.search is not None and self._goal_maps is not None
+        goal = self._goal_features
+        pair = None if view is None or goal is None else Pair(view.features(), goal)
         action = int(self.search.act(
             picture.numpy(), self._goal_maps, np.array([self._last_action]),
             np.array([self._starts]), None if odometry is None else odometry[None], [scan],
-            zoom)[0])
+            zoom, [pair])[0])
         self.arrival = float(self.search.arrival[0])
         self._last_action, self._starts = action, False
         if self.arrived:
@@ -282,6 +301,8 @@ class BatchedPolicy:
         zoom: how many times the robots' lens magnifies against the policy's, for one that
             searches; see `vn_nav.policy.search.lens`.
         scanner: what measures the `scan` of observations, if the robots have one.
+        verify: as of `PolicyRuntime`; pictures may be larger then than the network's.
+        camera_fov, camera_pitch: of the robots' square pictures [rad], for `verify`.
 
     Attributes:
         arrival: [N] float32 probability that the robots have arrived, by the head `arrival`, at
@@ -293,14 +314,17 @@ class BatchedPolicy:
     """
 
     def __init__(self, network: Policy, num_envs: int, decoding: str = 'sample', seed: int = 0,
-                 scanner: Scanner | None = None, zoom: float = 1.0):
+                 scanner: Scanner | None = None, zoom: float = 1.0, verify: str = NONE,
+                 camera_fov: float = math.pi / 2, camera_pitch: float = 0.0):
         _check_decoding(decoding)
+        check_verify(verify, isinstance(network, SearchPolicy))
+        self._features = None if verify == NONE else FeaturePairs(camera_fov)
         self.network, self.decoding, self.scanner = network, decoding, scanner
         self._zoom = zoom
         self._generator = torch.Generator().manual_seed(seed)
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self.logits: torch.Tensor | None = None
-        self.search = _search(network, num_envs)
+        self.search = _search(network, num_envs, camera_pitch)
         self._state: RecurrentState | None = (
             network.initial_state(num_envs) if self.search is None else None)
         self._goals: np.ndarray | None = None
@@ -315,7 +339,8 @@ class BatchedPolicy:
 
     @torch.inference_mode()
     def act(self, obs: dict[str, np.ndarray], goals: np.ndarray, reset_mask: np.ndarray,
-            scene: np.ndarray | None = None) -> np.ndarray:
+            scene: np.ndarray | None = None,
+            full: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
         """Actions [N] int64.
 
         Args:
@@ -328,6 +353,8 @@ class BatchedPolicy:
                 another array is passed, so do not write into one.
             reset_mask: [N] bool, where an episode begins with this observation.
             scene: [N] number of each robot's scene; only for a network with several.
+            full: pictures [N,3,H,H] and goals [G,3,H,H] in full, for `verify`; None: nothing is
+                verified.
 
         Raises:
             FloatingPointError: the logits are not finite.
@@ -347,8 +374,10 @@ class BatchedPolicy:
         if self.search is not None:
             scans = None if self.scanner is None else [
                 Scan(self.scanner, ranges) for ranges in obs['scan']]
+            pairs = None if self._features is None or full is None else self._features.of(
+                *full, np.asarray(obs['goal_index']))
             chosen = self.search.act(obs['image'], maps, last_action, reset_mask,
-                                     obs.get('odometry'), scans, self._zoom)
+                                     obs.get('odometry'), scans, self._zoom, pairs)
             self.arrival = self.search.arrival.copy()
             return chosen
         observation = Observation(
@@ -369,9 +398,11 @@ class BatchedPolicy:
         return actions.numpy()
 
 
-def _search(network: Policy, num_envs: int) -> SearchDriver | None:
+def _search(network: Policy, num_envs: int, pitch: float) -> SearchDriver | None:
     """What decides where the network only sees."""
-    return SearchDriver(network, num_envs) if isinstance(network, SearchPolicy) else None
+    if not isinstance(network, SearchPolicy):
+        return None
+    return SearchDriver(network, num_envs, pitch=pitch)
 
 
 def _check_decoding(decoding: str) -> None:

@@ -15,11 +15,13 @@ from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
 from vn_nav.policy.search.costmap import Costmap
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
 from vn_nav.policy.search.lens import in_metres, ranges_in_metres
+from vn_nav.policy.search.local_features import compare
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.recall import Recall
 from vn_nav.policy.search.registration import Registration
 from vn_nav.policy.search.searcher import Searcher, Sight
+from vn_nav.policy.search.verification import Pair, verified
 
 
 class SearchDriver:
@@ -28,6 +30,7 @@ class SearchDriver:
     Args:
         network: what sees.
         num_envs: robots, N.
+        pitch: down, of the cameras [rad]; where local features are given alone.
 
     Attributes:
         searchers: [N], with map and hypotheses of each robot.
@@ -35,9 +38,9 @@ class SearchDriver:
         arrival: [N] float32 probability that the robots have arrived, at the newest pictures.
     """
 
-    def __init__(self, network: SearchPolicy, num_envs: int):
+    def __init__(self, network: SearchPolicy, num_envs: int, pitch: float = 0.0):
         config = network.config
-        self.network = network
+        self.network, self._pitch = network, pitch
         self._bearings = bearings = column_bearings(config.view)
         self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint,
                                    network.rules)
@@ -79,7 +82,8 @@ class SearchDriver:
     @torch.inference_mode()
     def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
             starts: np.ndarray, odometry: np.ndarray | None,
-            scans: Sequence[Scan | None] | None = None, zoom: float = 1.0) -> np.ndarray:
+            scans: Sequence[Scan | None] | None = None, zoom: float = 1.0,
+            pairs: Sequence[Pair | None] | None = None) -> np.ndarray:
         """Actions [N] int64.
 
         Args:
@@ -90,6 +94,8 @@ class SearchDriver:
             odometry: [N,3] x, y [m], yaw [rad]; None: nobody has any.
             zoom: how many times the lens of pictures and goals magnifies, see `lens`.
             scans: [N] measured ranges; None: of nobody, or not of this robot at this picture.
+            pairs: [N] local features of full pictures, which verify what the network sees; None:
+                of nobody, or not of this robot.
 
         Raises:
             FloatingPointError: what the networks say is not finite.
@@ -111,6 +117,9 @@ class SearchDriver:
                 ranges = ranges_in_metres(self.network.goal_ranges(goal_maps[n:n + 1]),
                                           self._bearings, zoom)
                 searcher.registration = Registration(bearings, ranges[0].exp().numpy())
+            pair = None if pairs is None else pairs[n]
+            if pair is not None:
+                sight = verified(sight, compare(pair.own, pair.goal, self._pitch))
             recall = None
             # Through another lens the key pictures look different.
             if self.recalls is not None and self._keys is not None and (
