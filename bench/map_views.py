@@ -142,6 +142,7 @@ class OpenEyes:
     def __init__(self, network: SearchPolicy, searchers: list[MapSearcher]):
         self._network, self._searchers = network, searchers
         self.config, self.taught = network.config, network.taught
+        self.goal_ranges = network.goal_ranges
 
     def look(self, image: torch.Tensor, goal_maps: torch.Tensor) -> Look:
         """As `SearchPolicy.look`; zeros of the others."""

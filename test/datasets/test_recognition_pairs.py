@@ -52,6 +52,16 @@ def test_there_in_sight_nearly_there_and_elsewhere(sampler):
         PairSampler(SCENES, size=36, mix='other')
 
 
+def test_the_goal_is_seen_from_any_side(sampler):
+    sampler.count = 0
+    pairs = sampler.draw_groups(400, 1)
+    turn = np.degrees(np.abs(np.arctan2(pairs['goal_pose'][:, 3], pairs['goal_pose'][:, 2])))
+    away = np.hypot(*pairs['goal_pose'][:, :2].T)
+    seen = pairs['overlap'] >= 0.25
+    assert (seen & (turn > 60)).mean() > 0.08 and (seen & (turn > 90)).mean() > 0.03
+    assert (seen & (away > 1.5)).mean() > 0.12
+
+
 def test_groups_say_who_has_arrived_and_how_far_it_is(sampler):
     sampler.count = 100
     groups = sampler.draw_groups(60, 1, bearings=BEARINGS)

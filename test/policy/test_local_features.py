@@ -17,8 +17,6 @@ from vn_nav.policy.search.local_features import (
     Features,
     compare,
     extract,
-    restored,
-    stored,
 )
 from vn_nav.policy.search.searcher import Sight
 from vn_nav.policy.search.verification import (
@@ -140,15 +138,6 @@ def test_a_large_picture_is_made_smaller(room):
     # It lies to the same picture, smaller, as that lies to itself.
     both = compare(found, features(room, 0, 0, 0))
     assert both.inliers > 40 and abs(both.heading) < math.radians(1)
-
-
-def test_stored_descriptors_still_match(room):
-    one, other = features(room, 0, 0, 0), features(room, 0.4, 0, 0)
-    kept = stored(other.descriptors)
-    assert kept.dtype == np.uint8
-    again = other._replace(descriptors=restored(kept))
-    before, after = compare(one, other), compare(one, again)
-    assert after.matches == pytest.approx(before.matches, rel=0.1)
 
 
 def sight(**options) -> Sight:

@@ -56,7 +56,7 @@ def test_a_measured_map_does_as_well():
     grid.add_scan(np.zeros(3), scan, BEARINGS)
     found = Registration(BEARINGS, seen_from(GOAL)).fit(grid, GOAL + (0.4, 0.3, 0.1), 4.0)
     gap, turn = apart(found, GOAL)
-    assert gap < 0.2 and turn < math.radians(8)
+    assert gap < 0.3 and turn < math.radians(8)
 
 
 def test_floor_that_nobody_has_seen_says_nothing():

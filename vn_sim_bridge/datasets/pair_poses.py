@@ -19,18 +19,24 @@ CLOSE = (0.15, 1.0, math.radians(40))  # arrivals are among these
 # last angle is that of the robot's place off the line behind the goal. The rest stands anywhere.
 BEHIND = (0.35, 6.0, math.radians(40), math.radians(60))
 GOAL_CLEARANCE = 0.5  # m, free straight ahead of a goal: no picture of a wall alone
-# The mixture `RECOGNITION` is for telling the goal from what is nearly it: about half there or
-# where the goal is likely seen, a fifth nearly there (the hard ring), the rest elsewhere. Shares
+# The mixture `RECOGNITION` is for telling the goal from what is nearly it: about two fifths there
+# or where the goal is likely seen, a fifth each nearly there (the hard ring) and across, the rest
+# elsewhere. Shares
 # (what is left of one stands anywhere in the place); distances [m] and headings off the goal's
 # [rad], each drawn between two limits. Thirds taught to recognise near goals alone: of those
 # beyond 3 m a quarter was called in view, at a heading no better than chance; a pair counts both
 # ways round, and from afar the goal is in view one way only.
 USUAL, RECOGNITION = 'usual', 'recognition'  # mixtures
-THERE = (0.10, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
-SEEN, AFAR = 0.38, 0.75  # as `NEARBY` and `BEHIND`: share, and that of `BEHIND` in it
-BESIDE = (0.11, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
-ASKEW = (0.10, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew
-TURNED = (0.16, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
+THERE = (0.08, 0.0, 0.6, 0.0, math.radians(30))  # arrivals, but for walls in between,
+SEEN, AFAR = 0.32, 0.75  # as `NEARBY` and `BEHIND`: share, and that of `BEHIND` in it
+BESIDE = (0.10, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
+ASKEW = (0.08, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew
+TURNED = (0.10, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
+# What the goal looks at, from anywhere: a robot that searches sees it from any side, and without
+# such pairs called half of those with an overlap of a half, at a heading no better than chance.
+# Share; limits of how far the place that both look at is from the goal, and from the robot [m];
+# how far off the robot's heading is from it [rad].
+ACROSS = (0.26, 0.7, 3.5, 0.7, 4.5, math.radians(30))
 TRIES = 12  # draws of a goal or of a robot before the last one is taken as it is
 
 
@@ -146,6 +152,9 @@ def place_to_recognise(draws, places, cells, first_cell, rects, first_rect, free
                              nearest, farthest, least, most, places[k], rects, first_rect, free,
                              origins, radius)
             begin += share
+        if begin <= draws[k, 1] < begin + ACROSS[0]:
+            _stand_across(poses[k], goal_poses[k], draws[k, 2], draws[k, 3 + 2 * TRIES:],
+                          places[k], rects, first_rect, free, origins, radius)
 
 
 @numba.njit(cache=True)
@@ -164,6 +173,27 @@ def _stand_about(pose, goal, turn, rest, nearest, farthest, least, most, place, 
             pose[0], pose[1] = x, y
             off = (2 * turn - 1) * (most - least)
             yaw = goal[2] + off + (least if off >= 0 else -least)
+            pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi
+            break
+
+
+@numba.njit(cache=True)
+def _stand_across(pose, goal, turn, rest, place, rects, first_rect, free, origins, radius):
+    """A robot [4] that faces a place ahead of a goal [4] as the goal does, from any side.
+
+    Where it fits nowhere it stays where it is.
+    """
+    _, goal_near, goal_far, near, far, off = ACROSS
+    for attempt in range(TRIES):
+        ahead = goal_near + (goal_far - goal_near) * rest[3 * attempt + 2]
+        u, v = goal[0] + ahead * math.cos(goal[2]), goal[1] + ahead * math.sin(goal[2])
+        distance = math.sqrt(near**2 + (far**2 - near**2) * rest[3 * attempt])
+        angle = 2 * math.pi * rest[3 * attempt + 1]
+        x, y = u + distance * math.cos(angle), v + distance * math.sin(angle)
+        if _fits(u, v, place, rects, first_rect, free, origins, 0.0) and _fits(
+                x, y, place, rects, first_rect, free, origins, radius):
+            pose[0], pose[1] = x, y
+            yaw = angle + math.pi + (2 * turn - 1) * off
             pose[2] = (yaw + math.pi) % (2 * math.pi) - math.pi
             break
 

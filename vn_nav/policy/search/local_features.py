@@ -28,7 +28,6 @@ LEAST, AGREE = 8, 12  # matches to look for a motion in, and those that make one
 PIXELS, SURE, ROUNDS = 1.5, 0.999, 500  # of the search for it
 NEARLY_NOTHING = 1e-4  # likeness of pictures without a match
 EDGE = 8  # pixels beside where a camera does not reach
-STEPS = 512  # of a component of a descriptor, between 0 and 1, where it is stored
 DEPTH, FARTHEST = 2.5, 4.0  # m: of matched points as a rule; a motion between pictures, at most
 
 
@@ -189,14 +188,3 @@ def _rotation(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.nda
     left, _, right = np.linalg.svd(one.T @ other)
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     return turn, np.linalg.norm(one @ turn - other, axis=1)
-
-
-def stored(descriptors: np.ndarray) -> np.ndarray:
-    """Descriptors [F,128] as uint8, a quarter of the bytes."""
-    return np.minimum(np.round(descriptors * STEPS), 255).astype(np.uint8)
-
-
-def restored(descriptors: np.ndarray) -> np.ndarray:
-    """What `stored` kept, float32 of length 1."""
-    found = descriptors.astype(np.float32)
-    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
