@@ -14,6 +14,7 @@ from vn_nav.learning.sight_losses import WEIGHTS, range_loss, recognise, recogni
 from vn_nav.policy.search.look import arrival_by_pose, median_ranges
 from vn_nav.policy.search.network import (
     PER_AXIS,
+    Recognition,
     SearchPolicy,
     agreed,
     heading_deviation,
@@ -68,10 +69,11 @@ class Judged(NamedTuple):
 
 
 @torch.no_grad()
-def judge(network: SearchPolicy, batch: dict[str, np.ndarray]) -> Judged:
+def judge(network: SearchPolicy, batch: dict[str, np.ndarray], mirror: bool = True) -> Judged:
     """What a network says of pairs, in float32; a view belongs to pairs of its group alone.
 
-    As on a robot: of the pictures and of their mirror images together.
+    As on a robot of the pictures and of their mirror images together; without `mirror` of the
+    pictures alone.
     """
     before, network.compute_dtype = network.compute_dtype, torch.float32
     said, ranges = [], []
@@ -82,11 +84,14 @@ def judge(network: SearchPolicy, batch: dict[str, np.ndarray]) -> Judged:
         views = torch.from_numpy(image[begin:begin + step])
         own = (first >= begin) & (first < begin + step)
         pairs = first[own] - begin, second[own] - begin
-        said.append(agreed(recognise(network, views, *pairs),
-                           mirrored(recognise(network, views.flip(-1), *pairs))))
-        ranges.append(network.see_ranges(views))
+        seen = recognise(network, views, *pairs)
+        if mirror:
+            seen = agreed(seen, mirrored(recognise(network, views.flip(-1), *pairs)))
+        said.append(seen)
+        ranges.append(network.see_ranges(views) if mirror
+                      else network.ranges(views, torch.float32))
     network.compute_dtype = before
-    seen = type(said[0])(*(torch.cat(parts) for parts in zip(*said, strict=True)))
+    seen = Recognition(*(torch.cat(parts) for parts in zip(*said, strict=True)))
     log_ranges = torch.cat(ranges)
     parts = {**recognition_losses(seen, batch), 'ranges': range_loss(log_ranges, batch['ranges'])}
     by_pose = torch.sigmoid(seen.co_visible) * arrival_by_pose(
