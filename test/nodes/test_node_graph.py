@@ -6,11 +6,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from fake_robot import LATCHED, RELIABLE, robot_and_node
 from geometry_msgs.msg import Twist, TwistStamped
 from lifecycle_msgs.msg import Transition
-from ros_harness import wait_until, write_checkpoint
+from ros_harness import PATIENCE, wait_until, write_checkpoint
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from vn_nav.nodes.qos import qos
+from vn_nav.resources import share_file
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 TOPICS = ('cmd_vel', 'action', 'action_names', 'arrived')
@@ -115,3 +116,16 @@ def test_a_finalized_node_keeps_no_publisher(checkpoint, tmp_path):
         wait_until(lambda: robot.node.count_publishers('cmd_vel'), robot.spin)
         assert robot.transition(Transition.TRANSITION_ACTIVE_SHUTDOWN)
         wait_until(lambda: not robot.node.count_publishers('cmd_vel'), robot.spin)
+
+
+def test_full_pictures_are_verified_by_local_features(tmp_path):
+    node = {'verify': 'sift', 'inference_timeout': 1.0}
+    with robot_and_node(share_file('models/search'), tmp_path, node=node,
+                        robot={'size': (320, 240), 'odometry': RELIABLE}) as (robot, _):
+        robot.drive()
+
+
+def test_a_policy_that_does_not_search_verifies_nothing(checkpoint, tmp_path):
+    with robot_and_node(checkpoint, tmp_path, node={'verify': 'sift'}) as (_, process):
+        assert process.wait(PATIENCE) == 2
+    assert 'local features verify' in (tmp_path / 'log').read_text()
