@@ -88,7 +88,8 @@ def test_measured_ranges_reach_the_map(watcher, tmp_path, sensor):
     with (child(BRIDGE, tmp_path / 'bridge', house=7, size=64, noise=False, time='lock_step',
                 stop='declared'),
           child(NODE, tmp_path / 'policy', checkpoint=share_file('models/search'),
-                time='lock_step', auto_enable=True, **topic)):
+                time='lock_step', auto_enable=True, stop_threshold=1.0, **topic)):
+        # Never declared: a second episode would begin another map.
         wait_until(lambda: len(watcher.heard['policy_node/map']) >= 2
                    and int(watcher.values().get('ranges_used', 0)) >= 4, watcher.spin,
                    what=(tmp_path / 'policy').read_text())
