@@ -21,6 +21,7 @@ from vn_nav.errors import UserError
 from vn_nav.learning.sight_figures import figures, judge
 from vn_nav.policy.search.look import column_bearings
 from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.report import tables
 from vn_sim_bridge.datasets.pair_poses import RECOGNITION
 from vn_sim_bridge.datasets.view_pairs import PairSampler
 from vn_sim_bridge.render.randomisation import load_randomisation
@@ -69,8 +70,7 @@ def main() -> int:
     except UserError as error:
         print(f'bench/eyes.py: {error}', file=sys.stderr)
         return 2
-    print('\n'.join(f'| {" | ".join(line)} |'.replace('| ---', '|---').replace('--- |', '---|')
-                    for line in lines))
+    print(tables.markdown(lines))
     return 0
 
 

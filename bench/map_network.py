@@ -47,6 +47,7 @@ from vn_nav.evaluation.metrics import summarise
 from vn_nav.files import write_file
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.network_config import SEARCH
+from vn_nav.report import tables
 from vn_nav.report.tables import number
 from vn_nav.scenes import rooms_of
 
@@ -338,8 +339,7 @@ def markdown(options: argparse.Namespace) -> str:
             f'{own["success"]:.2f} ({low:.2f}-{high:.2f})', number(own['spl'], '.2f'), difference,
             f'{own["false_stops"]:.2f}', f'{own["reached"]:.2f}',
             f'{100 * own["collisions"]:.1f} %', f'{own["decisions"]:.0f}'])
-    return '\n'.join(f'| {" | ".join(line)} |'.replace('| ---', '|---').replace('--- |', '---|')
-                     for line in lines)
+    return tables.markdown(lines)
 
 
 def paired(difference: np.ndarray) -> str:

@@ -224,8 +224,7 @@ def markdown(found: dict[str, dict]) -> str:
             false, '' if declared is None or declared['within_1m'] is None else
             f'{declared["within_1m"]:.2f} ({number(declared["spl_within_1m"], ".2f")})',
             f'{last["collisions"]:.1%}'.replace('%', ' %'), f'{last["decisions"]:.0f}'])
-    return '\n'.join(f'| {" | ".join(line)} |'.replace('| ---', '|---').replace('--- |', '---|')
-                     for line in lines)
+    return tables.markdown(lines)
 
 
 def _success(figures: dict | None) -> list[str]:

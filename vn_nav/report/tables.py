@@ -140,3 +140,9 @@ def scenes_html(scenes: dict, stop: str) -> str:
     """The figures of each scene, of one kind of stop, as an HTML table."""
     headings, lines = _scenes_cells(scenes, stop)
     return table(headings, [[html.escape(cell) for cell in line] for line in lines])
+
+
+def markdown(lines: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as a Markdown table; the second is of '---'."""
+    return '\n'.join(f'| {" | ".join(line)} |'.replace('| ---', '|---').replace('--- |', '---|')
+                     for line in lines)

@@ -33,7 +33,7 @@ BESIDE = (0.10, 0.6, 1.5, 0.0, math.radians(45))  # the hard ring: beside it,
 ASKEW = (0.08, 0.0, 0.6, math.radians(30), math.radians(60))  # or askew
 TURNED = (0.10, 0.0, 4.0, math.radians(60), math.pi)  # look-alikes: the same room, another view
 # What the goal looks at, from anywhere: a robot that searches sees it from any side, and without
-# such pairs called half of those with an overlap of a half, at a heading no better than chance.
+# such pairs it often did not recognise the goal there.
 # Share; limits of how far the place that both look at is from the goal, and from the robot [m];
 # how far off the robot's heading is from it [rad].
 ACROSS = (0.26, 0.7, 3.5, 0.7, 4.5, math.radians(30))

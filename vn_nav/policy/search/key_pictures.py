@@ -15,7 +15,13 @@ from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.pose_graph import between, compose
 from vn_nav.policy.encoders import apply, directions
 from vn_nav.policy.search.lens import pose_in_metres
-from vn_nav.policy.search.network import PER_AXIS, Recognition, SearchPolicy, heading_deviation
+from vn_nav.policy.search.network import (
+    PER_AXIS,
+    Recognition,
+    SearchPolicy,
+    heading_deviation,
+    views_of,
+)
 from vn_nav.policy.search.taught import TaughtPlace
 
 ALIKE, TRACKED = 8, 4  # key pictures that a picture is compared with: most alike; about the robot
@@ -80,8 +86,7 @@ class KeyPictures:
         pictures = torch.from_numpy(place.pictures)
         self._seen = torch.cat([network.see(part) for part in pictures.split(64)])
         self._maps = torch.cat([network.encode_goals(part) for part in pictures.split(64)])
-        self._pooled = _pooled(network.encoder.encode_goals(pictures, network.compute_dtype)
-                               ).flatten(0, 1)
+        self._pooled = _pooled(views_of(self._maps, self._seen)[:, 0]).flatten(0, 1)
 
     @torch.inference_mode()
     def poses_of_goal(self, goal_maps: Tensor) -> list[Mode]:

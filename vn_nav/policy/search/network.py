@@ -156,7 +156,7 @@ class SearchPolicy(Policy):
         Args:
             seen: [N,2,...] of `see`; goal_maps: [N,...] of `encode_goals`.
         """
-        maps = goal_maps[:, :-COLUMNS * BINS].unflatten(1, seen.shape[1:])
+        maps = views_of(goal_maps, seen)
         own, other = (self.recogniser(self.encoder.meet(seen[:, k], maps[:, k], None)[1])
                       for k in range(2))
         return agreed(own, mirrored(other))
@@ -197,6 +197,15 @@ class SearchPolicy(Policy):
             UserError: always.
         """
         raise _no_actor()
+
+
+def views_of(goal_maps: Tensor, seen: Tensor) -> Tensor:
+    """Maps [G,2,C,h,w] of goals and of their mirror images, of `SearchPolicy.encode_goals`.
+
+    Args:
+        goal_maps: [G,...]; seen: of `SearchPolicy.see`, whose maps are as large.
+    """
+    return goal_maps[:, :-COLUMNS * BINS].unflatten(1, seen.shape[1:])
 
 
 def mirrored(said: Recognition) -> Recognition:
