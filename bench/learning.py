@@ -13,7 +13,6 @@ docs/curves/table/, thinned; `vn_nav compare` makes the table and the figure fro
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import signal
 import subprocess
@@ -22,13 +21,12 @@ import time
 from pathlib import Path
 
 from vn_nav.errors import UserError
-from vn_nav.report.curves import HOLD_SHARE, THRESHOLDS, reached, read_runs
+from vn_nav.report.curves import HOLD_SHARE, THRESHOLDS, reached, read_runs, thin
 
 ROOT = Path(__file__).resolve().parent.parent
 CURVES = ROOT / 'docs' / 'curves' / 'table'
 MINUTES = {'a2c': 30, 'unreal': 90, 'thesis': 90, 'fast': 30}
 HOUSE, ROOMS = 3, 2
-ROWS = 400  # kept of a curve
 
 
 def command(preset: str, seed: int, folder: Path, minutes: float) -> list[str]:
@@ -49,28 +47,6 @@ def is_over(folder: Path, minutes: float) -> bool:
     now = run.columns['minutes'][-1]
     there = reached(run, max(THRESHOLDS))
     return now >= 0.999 * minutes or there is not None and now >= there[1] + HOLD_SHARE * minutes
-
-
-def read(folder: Path) -> list[dict]:
-    """The rows of a run's metrics."""
-    path = folder / 'metrics.csv'
-    if not path.exists():
-        return []
-    with open(path, newline='') as file:
-        return list(csv.DictReader(file))
-
-
-def keep_curve(folder: Path, curves: Path = CURVES) -> None:
-    """Write a run's curve into a versioned folder, with at most `ROWS` rows."""
-    rows = read(folder)
-    every = max(1, -(-len(rows) // ROWS))
-    thinned = rows[::-every][::-1]  # the last row is among them
-    target = curves / folder.name / 'metrics.csv'
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with open(target, 'w', newline='') as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(thinned)
 
 
 def write_table(curves: Path) -> None:
@@ -107,13 +83,13 @@ def main():
                 del running[core]
                 if process.returncode:
                     raise SystemExit(f'{folder.name} ended with {process.returncode}: see its log')
-                keep_curve(folder)
+                thin(folder, CURVES / folder.name)
             if waiting:
                 preset, seed = waiting.pop(0)
                 folder = arguments.runs / f'{preset}-seed{seed}'
                 minutes = arguments.minutes or MINUTES[preset]
                 if is_over(folder, minutes):
-                    keep_curve(folder)
+                    thin(folder, CURVES / folder.name)
                     continue
                 print(f'core {core}: {folder.name}, {minutes:g} minutes', flush=True)
                 with open(arguments.runs / f'{folder.name}.log', 'a') as log:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import torch
 
-from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.search.costmap import Costmap
 from vn_nav.policy.search.grid import CELL, KNOWN, MOST, OccupancyGrid
 from vn_nav.policy.search.hypotheses import AGAIN, Hypotheses, Hypothesis, apart
@@ -28,6 +28,7 @@ from vn_nav.policy.search.look import (
 )
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.searcher import Searcher
+from vn_nav.policy.search.torch_eyes import TorchEyes
 
 PIXELS = 32  # a side of a crop; the robot stands in its middle and looks up
 SCALES = 0.15, 0.45  # m of a pixel: 4.8 m for the next moves, 14.4 m for where to go
@@ -114,7 +115,8 @@ class MapDriver:
         self.searchers = [MapSearcher(config.moves, column_bearings(config.view), RANGE_EDGES,
                                       config.footprint, plans=plans) for _ in range(num_envs)]
         self._policy.search.searchers[:] = self.searchers
-        self._policy.search.network = OpenEyes(network, self.searchers)  # type: ignore[assignment]
+        self._policy.search.eyes = TorchEyes(
+            OpenEyes(network, self.searchers))  # type: ignore[arg-type]
         self._maps = np.zeros((num_envs, CHANNELS, PIXELS, PIXELS), np.uint8)
 
     def advise(self, observation: dict, goals: np.ndarray, reset: np.ndarray
@@ -142,7 +144,7 @@ class OpenEyes:
     def __init__(self, network: SearchPolicy, searchers: list[MapSearcher]):
         self._network, self._searchers = network, searchers
         self.config, self.taught = network.config, network.taught
-        self.goal_ranges = network.goal_ranges
+        self.compute_dtype = network.compute_dtype
 
     def look(self, image: torch.Tensor, goal_maps: torch.Tensor) -> Look:
         """As `SearchPolicy.look`; zeros of the others."""
@@ -228,7 +230,7 @@ def numbers_of(searchers: list[MapSearcher], last_action: np.ndarray) -> np.ndar
     """[N,NUMBERS] float32: the newest look, ranges, last action [N], the best hypothesis."""
     seen = [own.seen for own in searchers]
     ranges = torch.from_numpy(np.stack([sight.ranges for sight in seen]))
-    medians = median_ranges(ranges.clamp(min=1e-9).log()).log().numpy()
+    medians = np.log(median_ranges(ranges.clamp(min=1e-9).log().numpy()))
     rows = []
     for own, sight, action, median in zip(searchers, seen, last_action, medians, strict=True):
         best = max(own.hypotheses.all, key=strength, default=None)

@@ -60,11 +60,14 @@ from vn_nav.learning.sight_figures import (
 from vn_nav.lens import squeezed_pose, zoom_of
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.search.driver import sights_of
+from vn_nav.policy.search.eyes import Placed
 from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.local_features import SIDE, compare, extract
-from vn_nav.policy.search.look import BINS, COLUMNS, Look, column_bearings
-from vn_nav.policy.search.network import PER_AXIS, SearchPolicy, heading_deviation
-from vn_nav.policy.search.verification import NONE, VERIFY, evidence, verified
+from vn_nav.policy.search.look import BINS, COLUMNS, Look, Recognition, column_bearings
+from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.torch_eyes import TorchEyes
+from vn_nav.policy.search.verification import evidence, verified
+from vn_nav.policy.search.views import NONE, VERIFY
 from vn_nav.resources import share_file
 from vn_nav.robot import RobotSpec
 from vn_sim_bridge.recorded.image_graph import build_graph
@@ -132,12 +135,11 @@ def look(network: SearchPolicy, images: np.ndarray, pairs: Pairs, zoom: float) -
         own, other = (torch.from_numpy(part[begin:begin + BATCH])
                       for part in (pairs.first, pairs.second))
         said = network.recogniser(network.encoder.meet(seen[own], goals[other], None)[1])
-        ranges = torch.full((len(own), COLUMNS, BINS), -math.log(BINS))
-        parts.append(in_metres(Look(
-            ranges, said.position, PER_AXIS * said.log_scale.exp(), said.heading,
-            heading_deviation(said.log_concentration), said.co_visible, said.arrived),
-            column_bearings(network.config.view), zoom)._replace(ranges=ranges[:, :1, :1]))
-    return Look(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        ranges = np.full((len(own), COLUMNS, BINS), -math.log(BINS), np.float32)
+        placed = Placed.of(Recognition(*(part.numpy() for part in said)))
+        parts.append(in_metres(Look(ranges, *placed), column_bearings(network.config.view),
+                               zoom)._replace(ranges=ranges[:, :1, :1]))
+    return Look(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def judge(pairs: Pairs, score: np.ndarray, position: np.ndarray | None = None,
@@ -247,7 +249,8 @@ class Told:
     """
 
     def __init__(self, network: SearchPolicy, zoom: float, fov: float, metres: float):
-        self.config, self.taught, self._network = network.config, None, network
+        self.config, self.taught, self.rules = network.config, None, network.rules
+        self.compute_dtype, self._network = network.compute_dtype, network
         self._zoom, self._fov, self._metres = zoom, fov, metres
         self.truth = np.zeros((0, 4))
 
@@ -273,7 +276,7 @@ class ToldActor(evaluator.PolicyActor):
         fov = env.robot.camera_fov
         self._eyes = Told(network, max(zoom_of(fov, network.config.view), 1.0), fov, metres)
         assert self.policy.search is not None  # by its architecture
-        self.policy.search.network = self._eyes
+        self.policy.search.eyes = TorchEyes(self._eyes)  # type: ignore[arg-type]
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:
         """Actions."""
@@ -349,9 +352,8 @@ def run(options: argparse.Namespace) -> None:
         images = sequence.pictures(camera, network.config.size, pairs.chosen)
         zoom = zoom_of(camera.fov, network.config.view) if told else 1.0
         said = look(network, images, pairs, zoom)
-        rows[name] = judge(pairs, said.co_visible.numpy(), said.position.numpy(),
-                           said.heading.numpy(), said.co_visible.numpy() > 0,
-                           said.arrived.numpy())
+        rows[name] = judge(pairs, said.co_visible, said.position, said.heading,
+                           said.co_visible > 0, said.arrived)
         if options.verify != NONE:
             rows |= {f'{name}, {title}': row
                      for title, row in judge_verified(sequence, pairs, said).items()}

@@ -30,7 +30,9 @@ import sys
 import time
 from pathlib import Path
 
-from learning import HOUSE, ROOMS, ROOT, is_over, keep_curve, write_table
+from learning import HOUSE, ROOMS, ROOT, is_over, write_table
+
+from vn_nav.report.curves import thin
 
 CURVES = ROOT / 'docs' / 'curves' / 'pretraining'
 WHOLE = CURVES.with_name('pretraining-whole')  # of the curves without a curriculum
@@ -105,7 +107,7 @@ def train(runs: Path, arm: str, seed: int, init: Path | None, minutes: float,
         if process.returncode:
             raise SystemExit(f'{folder.name} ended with {process.returncode}: see its log')
         (folder / 'over').touch()
-    keep_curve(folder, CURVES if curriculum else WHOLE)
+    thin(folder, (CURVES if curriculum else WHOLE) / folder.name)
 
 
 def main():

@@ -18,9 +18,10 @@ processes (`--rows`). Prints a Markdown table, ready for docs/results.md.
   **low**, **high**, **narrow**, **wide**: cameras 0.4 and 1.4 m high, fields of view of 70 and 110
   degrees (`bench/robots`), of a policy that was trained with another. All in the houses of
   `--split`, declared stop alone.
-- **one_look**, **no_refuting**, **no_fitting**, **no_looking**, **no_squeezing**: a part taken
-  away. **truth**, **truth_scan**: where the goal is comes from the simulator, not from the
-  picture; with the scan nothing that is seen decides any more. Declared stop alone.
+- **one_look**, **no_refuting**, **no_fitting**, **no_looking**, **no_squeezing**,
+  **no_returning**: a part taken away. **truth**, **truth_scan**: where the goal is comes from the
+  simulator, not from the picture; with the scan nothing that is seen decides any more. Declared
+  stop alone.
 """
 
 from __future__ import annotations
@@ -28,8 +29,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
-import hashlib
-import json
 import math
 import sys
 import time
@@ -44,15 +43,14 @@ from vn_nav.cli.world import load_for, machine, make_env_for
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.evaluator import ARRIVAL, DECLARED, STOPS
+from vn_nav.evaluation.kept import conditions_of, finished, keep
 from vn_nav.evaluation.measurement import (
     EvaluateConfig,
     measure_checkpoint,
     odometry_for,
     ranges_for,
 )
-from vn_nav.files import write_file
 from vn_nav.learning.auxiliary import POSE_OVERLAP
-from vn_nav.policy import search
 from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.search.look import Look
 from vn_nav.policy.search.network import SearchPolicy
@@ -64,7 +62,6 @@ from vn_nav.scenes import rooms_of
 
 TRUE_SIGMA, SURE = 0.05, 8.0  # m and rad; logit
 ROBOTS = Path(__file__).resolve().parent / 'robots'
-SEARCH = Path(search.__file__).parent  # what decides is no part of a checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,6 +107,7 @@ ROWS = {
     'no_fitting': Row('the goal is not fitted to the map', rules=Rules(registers=False)),
     'no_looking': Row('no turns to look', rules=Rules(look_from=math.inf)),
     'no_squeezing': Row('a stuck robot goes on as before', rules=Rules(unsticks=False)),
+    'no_returning': Row('it explores to the end of its budget', rules=Rules(returns=False)),
     'truth': Row('true recognition', truth=True),
     'truth_scan': Row('true recognition, map by a LaserScan', truth=True, ranges='scan'),
 }
@@ -118,27 +116,15 @@ ROWS = {
 def conditions(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> dict:
     """What a row's figures depend on; what was measured under others is measured again."""
     info = checkpoint.info
-    planner = hashlib.sha256(b''.join(path.read_bytes() for path in sorted(SEARCH.glob('*.py'))))
-    return {'sha256': info['sha256'], 'planner': planner.hexdigest(),
-            'split': row.split or options.split, 'houses': options.houses,
-            'episodes': options.episodes, 'seed': options.seed,
-            'max_decisions': options.max_decisions, 'stops': list(row.stops),
-            'stop_threshold': (info['stop_threshold'] if options.stop_threshold is None
-                               else options.stop_threshold),
-            'randomisation': row.randomisation or info['randomisation'],
+    common = conditions_of(
+        checkpoint, split=row.split or options.split, houses=options.houses,
+        episodes=options.episodes, seed=options.seed, max_decisions=options.max_decisions,
+        stops=row.stops, stop_threshold=options.stop_threshold)
+    return {**common, 'randomisation': row.randomisation or info['randomisation'],
             'odometry': odometry_for(checkpoint.network, row.odometry),
             'ranges': ranges_for(checkpoint.network, row.ranges),
             'camera': row.robot or 'as trained', 'control': row.control,
             'rules': None if row.rules is None else repr(row.rules), 'truth': row.truth}
-
-
-def finished(path: Path, wanted: dict) -> dict | None:
-    """A row that was measured before, under these conditions."""
-    try:
-        found = json.loads(path.read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
-        return None
-    return found if found.get('conditions') == wanted else None
 
 
 def measured(row: Row, checkpoint: LoadedCheckpoint, options: argparse.Namespace) -> dict:
@@ -265,7 +251,7 @@ def main() -> int:
                 if entry is None and asked and not options.only_print:
                     entry = {'row': name, 'checkpoint': str(options.checkpoint),
                              'conditions': wanted, **measured(row, checkpoint, options)}
-                    write_file(path, (json.dumps(entry, indent=2) + '\n').encode())
+                    keep(path, entry)
                     for stop, own in entry['figures'].items():
                         print(tables.row_line(f'{name}, {tables.TITLES[stop].lower()}', own, stop),
                               flush=True)

@@ -22,13 +22,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from learning import keep_curve
 from simulator_scenes import ROOT, scene
 
 from vn_nav.cli.world import machine
 from vn_nav.evaluation.evaluator import ARRIVAL, RANDOM, SHORTEST
 from vn_nav.report.chart import Series, legend, panel, to_picture
-from vn_nav.report.curves import average, read_runs
+from vn_nav.report.curves import average, read_runs, thin
 
 CURVES = ROOT / 'docs' / 'curves' / 'simulators'
 CHART = ROOT / 'docs' / 'images' / 'learning.png'
@@ -77,7 +76,7 @@ def run(task: str, runs: Path, core: int):
 
 def keep(task: str, runs: Path) -> None:
     """Curve and figures of a run that has ended, into the repository."""
-    keep_curve(runs / task, CURVES)
+    thin(runs / task, CURVES / task)
     figures = json.loads((runs / task / 'evaluation.json').read_text())
     text = json.dumps({'machine': machine(), **figures}, indent=1)
     (CURVES / task / 'evaluation.json').write_text(text.replace(str(ROOT) + '/', '') + '\n')

@@ -21,7 +21,7 @@ import numpy as np
 
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.policy.search.local_features import compare
-from vn_nav.policy.search.verification import VERIFY, View
+from vn_nav.policy.search.views import VERIFY, View
 from vn_nav.resources import share_file
 
 WARM, TIMES = 2, 15

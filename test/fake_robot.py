@@ -36,7 +36,8 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 AFTER = {  # what a lifecycle node is after a transition
     Transition.TRANSITION_CONFIGURE: 'inactive', Transition.TRANSITION_ACTIVATE: 'active',
     Transition.TRANSITION_DEACTIVATE: 'inactive', Transition.TRANSITION_CLEANUP: 'unconfigured',
-    Transition.TRANSITION_ACTIVE_SHUTDOWN: 'finalized'}
+    Transition.TRANSITION_ACTIVE_SHUTDOWN: 'finalized',
+    Transition.TRANSITION_UNCONFIGURED_SHUTDOWN: 'finalized'}
 
 
 class FakeRobot:
@@ -83,7 +84,7 @@ class FakeRobot:
         self._due = dict.fromkeys(self.sends, 0.0)
         self._rng = np.random.default_rng(0)
         self._pictures = [self._rng.integers(0, 255, (*reversed(size or (84, 84)), 3), np.uint8)
-                          for _ in range(8)]
+                          for _ in range(16)]
 
     def _hear(self, message):
         self.commands.append((time.monotonic(), twist_to_array(message)))
@@ -111,10 +112,13 @@ class FakeRobot:
         return rclpy.time.Time(nanoseconds=nanoseconds).to_msg()
 
     def picture(self, number=None, stamp=None):
-        """One of eight pictures, or the next of them."""
+        """The camera's next picture, of eight; or one of eight goals, which it never shows.
+
+        A policy that recognises its goal is not there at once.
+        """
         self.images += 1
-        number = self.images if number is None else number
-        message = fill_image(Image(), self._pictures[number % len(self._pictures)], 'rgb8')
+        which = self.images % 8 if number is None else 8 + number % 8
+        message = fill_image(Image(), self._pictures[which], 'rgb8')
         message.header.stamp = stamp or self.stamp(self.offset)
         return message
 
@@ -196,6 +200,13 @@ class FakeRobot:
         assert not answer.success
         return answer.message
 
+    def refuses(self, *words):
+        """Ask to enable until it is refused with all of these words."""
+        begun = time.monotonic()
+        while not all(word in (refusal := self.refusal()) for word in words):
+            assert time.monotonic() - begun < PATIENCE, (words, refusal)
+            self.spin()
+
     def moving(self):
         """The last command moves it."""
         return bool(self.commands) and bool(self.commands[-1][1].any())
@@ -204,7 +215,10 @@ class FakeRobot:
         """Show a goal, enable, and wait for the first motion."""
         self.show_goal()
         self.enable()
-        wait_until(self.moving, self.spin)
+        begun = time.monotonic()
+        while not self.moving():
+            assert time.monotonic() - begun < PATIENCE, self.statuses[-1:]
+            self.spin()
 
     def wait_for_zero(self, seconds=PATIENCE):
         """Spin until the last command is zero; when the first zero after the motion came."""

@@ -41,17 +41,31 @@ def exif(orientation, order='>'):
     return start + struct.pack(f'{order}IHHHIHHI', 8, 1, 0x0112, 3, 1, orientation, 0, 0)
 
 
+def lens_exif(orientation, focal_35mm, order='>'):
+    """EXIF data with an orientation, and a focal length in the directory that it points to."""
+    start = b'MM\0*' if order == '>' else b'II*\0'
+    field = f'{order}HHIHH'
+    return (start + struct.pack(f'{order}IH', 8, 2)
+            + struct.pack(field, 0x0112, 3, 1, orientation, 0)
+            + struct.pack(f'{order}HHII', 0x8769, 4, 1, 38)
+            + struct.pack(f'{order}I', 0)
+            + struct.pack(f'{order}H', 1) + struct.pack(field, 0xA405, 3, 1, focal_35mm, 0)
+            + struct.pack(f'{order}I', 0))
+
+
 def segment(marker, body, length=None):
     """A JPEG segment; `length` is what it says of itself."""
     return b'\xff' + bytes([marker]) + struct.pack(
         '>H', len(body) + 2 if length is None else length) + body
 
 
-def with_exif(file, orientation, order='>'):
-    """The same JPEG or PNG, held another way."""
+def with_exif(file, orientation, order='>', focal_35mm=None):
+    """The same JPEG or PNG, held another way, or of a lens that is told [mm]."""
+    data = (exif(orientation, order) if focal_35mm is None
+            else lens_exif(orientation, focal_35mm, order))
     if file[:2] == b'\xff\xd8':
-        return file[:2] + segment(0xE1, b'Exif\0\0' + exif(orientation, order)) + file[2:]
-    return file[:33] + chunk(b'eXIf', exif(orientation, order)) + file[33:]
+        return file[:2] + segment(0xE1, b'Exif\0\0' + data) + file[2:]
+    return file[:33] + chunk(b'eXIf', data) + file[33:]
 
 
 def frame(width, height, marker=0xC2, components=3, sampling=0x11):

@@ -13,7 +13,7 @@ from paths import ROOT, TESTS
 PACKAGES = ('vn_nav', 'vn_sim_bridge', 'vn_msgs_py')
 # The leaves that the simulator may use, and what its node shares with the other nodes.
 LEAVES = {'vn_nav.arrival', 'vn_nav.errors', 'vn_nav.goal_picture', 'vn_nav.observation',
-          'vn_nav.co_visibility', 'vn_nav.labels', 'vn_nav.lens',
+          'vn_nav.co_visibility', 'vn_nav.labels', 'vn_nav.lens', 'vn_nav.depth_ranges',
           'vn_nav.measured_ranges', 'vn_nav.reset_arguments', 'vn_nav.resources',
           'vn_nav.robot', 'vn_nav.scenes', 'vn_nav.structured_file'}
 NODE_SHARED = {'vn_nav.nodes.parameters', 'vn_nav.nodes.policy_parameters',
@@ -94,6 +94,8 @@ def test_dependencies(path):
         assert used <= allowed, f'the simulator knows only the leaves {sorted(allowed)}'
     if package == 'vn_msgs_py':
         allowed = {'numpy', 'cv2', 'vn_msgs_py'} | sys.stdlib_module_names
+        if name_of(path) == 'vn_msgs_py.heic_file':  # with an extra, and refused without it
+            allowed = allowed | {'pillow_heif'}
         assert roots(path) <= allowed, 'vn_msgs_py stands on NumPy and OpenCV alone'
 
 
@@ -138,7 +140,10 @@ def test_the_rest_imports_without_ros(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize('package, heavy', [
     ('vn_nav.learning', 'torch'), ('vn_nav.evaluation', 'torch'), ('vn_nav.cli.nodes', 'argparse'),
-    ('vn_nav.cli.commands', 'torch')])
+    ('vn_nav.cli.commands', 'torch'),
+    # Nodes that start in seconds, and on robots without these.
+    *((f'vn_nav.nodes.{name}_node', heavy) for name in ('policy', 'recorder', 'goal', 'teleop')
+      for heavy in ('torch', 'numba')), ('vn_sim_bridge.bridge_node', 'torch')])
 def test_a_package_is_light_until_something_of_it_is_used(package, heavy):
     code = f"""
 import sys
@@ -180,7 +185,8 @@ sys.exit(cli.main(sys.argv[1:]))
 @pytest.mark.slow
 @pytest.mark.parametrize('words', [
     ['bag', '--help'], ['--version'], ['--help'],
-    ['bag', 'doctor', 'BAG', '--checkpoint', 'models/house'], ['bag', 'recover', 'BAG', 'OUT'],
+    ['bag', 'doctor', 'BAG', '--checkpoint', 'models/house'],
+    ['doctor', '--bag', 'BAG', '--html', 'OUT'], ['bag', 'recover', 'BAG', 'OUT'],
     ['bag', 'show', 'BAG', '--out', 'OUT'], ['bag', 'export', 'BAG', '--lerobot', 'OUT']],
     ids=' '.join)
 def test_a_look_into_a_bag_takes_neither_torch_nor_numba_nor_a_gigabyte(tmp_path, words):

@@ -150,8 +150,9 @@ MAY_RESIZE = {
     'vn_nav/observation.py', 'vn_sim_bridge/render/scene.py', 'vn_sim_bridge/houses/materials.py',
     'vn_sim_bridge/tools/contact_sheet.py', 'vn_sim_bridge/tools/walk.py',
     'vn_nav/policy/search/local_features.py',  # a camera's full picture
+    'vn_msgs_py/heic_file.py',  # photographs
     'vn_nav/policy/zhu.py', 'vn_nav/policy/resnet.py', 'vn_nav/bags/doctor/content_checks.py',
-    'vn_nav/bags/report/figures.py',  # thumbnails for a page
+    'vn_nav/bags/report/figures.py', 'vn_nav/dashboard/pictures.py',  # for a page
     'vn_nav/report/search_map.py', 'vn_nav/report/film.py',  # what a policy knows, to look at
     'vn_sim_bridge/render/mesh_scene.py',  # textures
     'vn_sim_bridge/simulators/dmlab.py',  # colours and depth of an engine without labels

@@ -14,8 +14,8 @@ import torch
 from gymnasium import spaces
 
 from vn_nav.learning.rollout import Collector
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.network import Policy
-from vn_nav.policy.runtime import BatchedPolicy
 
 ACTIONS = ('left', 'right')
 LIMIT = 2  # decisions

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vn_msgs_py.exif import read_orientation
+from vn_msgs_py.exif import Exif, read_exif
 from vn_msgs_py.image_error import (
     MAX_PIXELS,
     ImageError,
@@ -41,7 +41,7 @@ class JpegFile(NamedTuple):
     height: int  # pixels, as stored
     width: int
     components: int  # 1: grey
-    orientation: int  # EXIF, 1 to 8
+    exif: Exif
     end: int  # bytes up to and with the end marker; what follows is not part of it
 
 
@@ -123,7 +123,7 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
         ImageError: it is truncated, contradicts itself or asks for more than is given.
     """
     view = np.frombuffer(data, np.uint8)
-    at, frame, orientation, segments = 2, None, 1, 0
+    at, frame, exif, segments = 2, None, Exif(), 0
     while True:
         if at + 4 > len(data) and data[at:at + 2] != b'\xff\xd9':
             raise _truncated(f'{len(data)} bytes without an end marker')
@@ -165,12 +165,12 @@ def examine_jpeg(data: bytes, most: int = MAX_PIXELS) -> JpegFile:
             if 8 * (at - begin) < bits:
                 raise _truncated(f'a scan of {at - begin} bytes for {frame.width} x '
                                  f'{frame.height} pixels')
-        elif marker == APP1 and orientation == 1 and body[:6] == EXIF:
-            orientation = read_orientation(body[6:])
+        elif marker == APP1 and exif == Exif() and body[:6] == EXIF:
+            exif = read_exif(body[6:])
     if frame is None:
         raise damaged('a JPEG has a frame header', f'{len(data)} bytes without one')
     frame.finish()
-    return JpegFile(frame.height, frame.width, len(frame.sampling), orientation, at + 2)
+    return JpegFile(frame.height, frame.width, len(frame.sampling), exif, at + 2)
 
 
 def _scan_end(view: np.ndarray, at: int) -> int:

@@ -6,6 +6,8 @@ decoder takes memory for it. What comes out is upright, as the file's EXIF orien
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
@@ -23,6 +25,13 @@ FOREIGN = ((b'GIF8', 'GIF'), (b'BM', 'BMP'), (b'II*\0', 'TIFF'), (b'MM\0*', 'TIF
 HEIF_BRANDS = (b'heic', b'heix', b'heim', b'heis', b'hevc', b'hevx', b'mif1', b'msf1')
 
 
+class DecodedPicture(NamedTuple):
+    """A picture, upright, and what its file says of the camera."""
+
+    picture: np.ndarray  # [H,W,3] uint8 RGB
+    fov: float | None  # of its shorter side [rad], by the EXIF focal length; None: unknown
+
+
 def decode_picture(data: bytes, *, smallest: int | None = None, largest: int = MAX_PIXELS,
                    mosaic: int | None = None) -> np.ndarray:
     """The picture [H,W,3] uint8 RGB in a whole JPEG or PNG file.
@@ -38,15 +47,23 @@ def decode_picture(data: bytes, *, smallest: int | None = None, largest: int = M
     Raises:
         ImageError: it is damaged, truncated, too large or in another format.
     """
+    return decode_with_lens(data, smallest=smallest, largest=largest, mosaic=mosaic).picture
+
+
+def decode_with_lens(data: bytes, *, smallest: int | None = None, largest: int = MAX_PIXELS,
+                     mosaic: int | None = None) -> DecodedPicture:
+    """The picture in a file, and its field of view; see `decode_picture`."""
     grey = False
     try:
         if data[:3] == JPEG_SIGNATURE:
             jpeg = jpeg_file.examine_jpeg(data, largest)
-            grey, orientation = jpeg.components == 1, jpeg.orientation
+            grey, exif = jpeg.components == 1, jpeg.exif
+            fov = exif.field_of_view(jpeg.height, jpeg.width)
             picture = _decode_jpeg(data, jpeg, None if mosaic is not None and grey else smallest)
         elif data[:8] == png_file.SIGNATURE:
             png = png_file.examine_png(data)
-            grey, orientation = png.colour == 0, png.orientation
+            grey, exif = png.colour == 0, png.exif
+            fov = exif.field_of_view(png.height, png.width)
             picture = png_file.decode_png(data, png)
             if picture is not None and picture.shape[:2] != (png.height, png.width):
                 picture = None
@@ -61,7 +78,7 @@ def decode_picture(data: bytes, *, smallest: int | None = None, largest: int = M
     if picture is None:
         raise ImageError('a compressed picture can be decoded', f'{len(data)} bytes',
                          'the data is damaged: check the camera driver, or copy the file again')
-    return make_upright(picture, orientation)
+    return DecodedPicture(make_upright(picture, exif.orientation), fov)
 
 
 def _decode_jpeg(data: bytes, jpeg: jpeg_file.JpegFile, smallest: int | None) -> np.ndarray | None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from vn_msgs_py.exif import read_orientation
+from vn_msgs_py.exif import Exif, read_exif
 from vn_msgs_py.image_error import ImageError, TooLargeError, check_size, damaged, truncated
 
 SIGNATURE = b'\x89PNG\r\n\x1a\n'
@@ -39,7 +39,7 @@ class PngFile(NamedTuple):
     depth: int  # bits of a value
     colour: int  # colour type
     interlaced: bool
-    orientation: int  # EXIF, 1 to 8
+    exif: Exif
     header: bytes  # signature, IHDR and PLTE, as they stand
     pixels: list[tuple[int, int]]  # where the compressed data lies: first byte, byte after
 
@@ -55,7 +55,7 @@ def examine_png(data: bytes) -> PngFile:
     if len(data) < 33:
         raise _truncated(f'{len(data)} bytes without an end chunk')
     shape = _read_header(data[16:29])
-    header, orientation, at, chunks = [SIGNATURE], 1, 8, 0
+    header, exif, at, chunks = [SIGNATURE], Exif(), 8, 0
     pixels: list[tuple[int, int]] = []  # where the chunks of pixels begin and end
     while True:
         chunks += 1
@@ -82,11 +82,11 @@ def examine_png(data: bytes) -> PngFile:
                 raise _truncated(f'{data[at:at + 12]!r} for an end chunk')
             break
         elif kind == b'eXIf':
-            orientation = read_orientation(data[begin:end])
+            exif = read_exif(data[begin:end])
         elif not (kind.isalpha() and kind[:1].islower()):
             raise damaged('every critical chunk of a PNG is known', f'{kind!r} at byte {at}')
         at = end + 4
-    png = PngFile(*shape, orientation, b''.join(header), pixels)
+    png = PngFile(*shape, exif, b''.join(header), pixels)
     _check_amount(png)
     return png
 

@@ -46,22 +46,36 @@ TOPICS = (
     _sensor('image_raw', _IMAGE, 'robot', 'camera picture, any encoding of vn_msgs_py.images'),
     _sensor('image_raw/compressed', 'sensor_msgs/msg/CompressedImage', 'robot',
             'camera picture as JPEG or PNG (image_transport: compressed)'),
-    _sensor('camera_info', 'sensor_msgs/msg/CameraInfo', 'robot', 'focal length of the camera'),
+    _sensor('camera_info', 'sensor_msgs/msg/CameraInfo', 'robot',
+            'lens of the camera, by which pictures are rectified and cut'),
     _latched('goal_image', _IMAGE, 'user',
              'where to go; a new header stamp begins a new episode'),
+    _latched('goal_camera_info', 'sensor_msgs/msg/CameraInfo', 'user',
+             "camera of the goal_image of the same stamp, where it is not the robot's"),
     Topic('cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
           'velocity command; TwistStamped with enable_stamped_cmd_vel', depth=1),
     Topic('shadow/cmd_vel', 'geometry_msgs/msg/Twist', 'policy',
           'mode shadow, in place of cmd_vel: no base subscribes to it', depth=1),
     Topic('executed_action', _STRING, 'user',
           'mode shadow: JSON: the stamp of a picture where a decision is wanted, the action '
-          'really done before it, and odometry [x, y, yaw] there, if known'),
+          'really done before it, and odometry [x, y, yaw] there, if known; ranges: the stamp '
+          'and the odometry of the scan or depth picture that belongs to it, or null'),
     Topic('odom', 'nav_msgs/msg/Odometry', 'robot', 'wheel odometry; actions are closed on it'),
     _history('action', 'std_msgs/msg/Int8', 'policy', 'discrete action chosen, for recording'),
     _latched('action_names', _STRING, 'policy', 'JSON list: the names behind action'),
     _latched('arrived', 'std_msgs/msg/Bool', 'policy',
              'true: it declares arrival and stands still; false: it does not, published '
              'again for every goal'),
+    _latched('goal_status', _STRING, 'policy',
+             'JSON: number of the goal; waiting, active, succeeded, failed or cancelled; error '
+             'code and message (docs/nav2.md), decisions, seconds'),
+    dataclasses.replace(Topic(
+        'goal_feedback', _STRING, 'policy', 'JSON, at every decision: the same, the state, '
+        'probability of arrival, estimated distance [m]'), debug=True),
+    dataclasses.replace(Topic(
+        'goal_estimate', 'geometry_msgs/msg/PoseStamped', 'policy', 'where a policy that '
+        'searches takes the goal to be, at every decision that has a guess', depth=1),
+        debug=True),
     dataclasses.replace(_latched(
         'policy_node/map', 'nav_msgs/msg/OccupancyGrid', 'policy',
         'debug: the map of a policy that searches, 0 free to 100 occupied, -1 unknown; once a '

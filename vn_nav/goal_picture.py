@@ -7,10 +7,9 @@ import os
 import shlex
 from pathlib import Path
 
-import numpy as np
-
+from vn_msgs_py.heic_file import MissingExtraError, decode_heic, is_heic
 from vn_msgs_py.image_error import ForeignFormatError, ImageError, TooLargeError
-from vn_msgs_py.picture_file import decode_picture
+from vn_msgs_py.picture_file import DecodedPicture, decode_with_lens
 from vn_nav.errors import UserError
 
 MAX_FILE_BYTES = 128_000_000
@@ -23,16 +22,16 @@ SEVERAL = ('GIF', 'TIFF', 'WebP')  # may hold several pictures
 KEPT_SIDE_PX = 1000  # of the shorter side: no policy sees more of a picture
 
 
-def read_goal_picture(path: Path) -> np.ndarray:
-    """The picture [H,W,3] uint8 RGB of a JPEG or PNG file, upright.
+def read_goal_picture(path: Path) -> DecodedPicture:
+    """The picture of a JPEG, PNG or HEIC file, upright, and its field of view if the file says it.
 
     A JPEG whose shorter side is 2,000 pixels or more is decoded at a half, a quarter or an eighth
-    of its size.
+    of its size. HEIC needs the extra `heic`.
 
     Raises:
-        UserError: there is no such file, or it holds something else.
+        UserError: there is no such file, it holds something else, or the extra is missing.
     """
-    rule = 'a goal picture is a JPEG or PNG file'
+    rule = 'a goal picture is a JPEG, PNG or HEIC file'
     if not path.is_file():
         raise UserError(rule, f'{path}: no such file', 'give another one')
     try:
@@ -43,7 +42,13 @@ def read_goal_picture(path: Path) -> np.ndarray:
     if len(data) > MAX_FILE_BYTES:
         raise UserError(f'{rule} of at most {MAX_FILE_BYTES} bytes', str(path), _smaller(path))
     try:
-        return decode_picture(data, smallest=KEPT_SIDE_PX, largest=MAX_JPEG_PX)
+        if is_heic(data):
+            return decode_heic(data, smallest=KEPT_SIDE_PX)
+        return decode_with_lens(data, smallest=KEPT_SIDE_PX, largest=MAX_JPEG_PX)
+    except MissingExtraError as error:
+        raise UserError("a HEIC goal picture is read with the extra 'heic', pillow-heif",
+                        str(path), f"pip install 'vn_nav[heic]', or "
+                        f"{_conversion(path, 'HEIC')}") from error
     except ForeignFormatError as error:
         kind = _received(data, error)
         raise UserError(rule, f'{path}: {kind}', _conversion(path, kind)) from error
@@ -75,8 +80,7 @@ def _conversion(path: Path, kind: str) -> str:
     # By its kind, whatever the name says; of several pictures the first one.
     source = shlex.quote(f'{READ_BY_IMAGEMAGICK[kind]}:{path}' + '[0]' * (kind in SEVERAL))
     target = shlex.quote(_argument(_free_name(path)))
-    return f'convert it: `convert {source} {target}` (ImageMagick)' + (
-        ', or in Python with pillow-heif' if kind == 'HEIC' else '')
+    return f'convert it: `convert {source} {target}` (ImageMagick)'
 
 
 def _free_name(path: Path, part: str = '') -> Path:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from vn_nav.errors import UserError
@@ -19,6 +19,35 @@ DEPTH_FARTHEST = 8.0  # m to which depth is believed
 DEPTH_COLUMNS = 96  # bearings that a wider depth picture is read along
 MOST_RAYS = 20_000  # of a scan
 FULL_TURN = 1e-3  # rad that a full turn may be off
+
+
+class RangeSource(NamedTuple):
+    """Which topic of a robot measured ranges come from."""
+
+    scan: str  # name of a topic of LaserScan; '': none
+    depth: str  # name of a topic of depth pictures, with `camera_info` beside it; '': none
+    mount: tuple[float, float, float]  # x ahead, y to the left [m], yaw [rad] of the sensor
+
+    def __bool__(self) -> bool:
+        return bool(self.scan or self.depth)
+
+    def check(self) -> None:
+        """Raise `UserError` where both topics are named."""
+        if self.scan and self.depth:
+            raise UserError('the map takes ranges from one topic',
+                            f'scan_topic {self.scan}, depth_topic {self.depth}',
+                            'leave one of them empty')
+
+    def check_policy(self, searches: bool) -> None:
+        """Raise `UserError` where a topic is named for a policy that has no map.
+
+        Args:
+            searches: it has one.
+        """
+        if self and not searches:
+            named = f'scan_topic {self.scan}' if self.scan else f'depth_topic {self.depth}'
+            raise UserError('measured ranges are for policies that search with a map',
+                            f'{named}; this one has none', 'leave it empty')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,45 +185,10 @@ class DepthCamera:
         Args:
             depth: [H,W] m along the optical axis; 0 or NaN: unknown.
         """
+        from vn_nav.depth_ranges import least_ranges  # Numba: other policies need none
         scanner = self.scanner(*depth.shape)
         slopes = np.tan(scanner.bearings)
         ranges = least_ranges(np.asarray(depth, np.float32), *self.focal, *self.centre,
                               self.height, self.pitch, 0.0, slopes)
         ranges[ranges > DEPTH_FARTHEST] = np.nan
         return Scan(scanner, ranges)
-
-
-@numba.njit(cache=True)
-def least_ranges(depth, focal_x, focal_y, centre_x, centre_y, camera_height, pitch, turn, slopes):
-    """Ranges to the nearest point at the height of a robot, [C] float32; NaN: nobody knows.
-
-    A point belongs to the bearing whose tangent is nearest, within half a column.
-
-    Args:
-        depth: [H,W] float32 m along the optical axis, 0 or NaN where nothing is seen.
-        focal_x, focal_y, centre_x, centre_y: see `DepthCamera`.
-        camera_height: above the floor; pitch: down; turn: of the camera against the bearings.
-        slopes: [C] tangents of the bearings, evenly spaced.
-    """
-    columns = len(slopes)
-    found = np.full(columns, np.nan, np.float32)
-    cp, sp = math.cos(pitch), math.sin(pitch)
-    ct, st = math.cos(turn), math.sin(turn)
-    step = slopes[1] - slopes[0] if columns > 1 else 0.1
-    for row in range(depth.shape[0]):
-        down = (row + 0.5 - centre_y) / focal_y
-        for column in range(depth.shape[1]):
-            z = depth[row, column]
-            height = camera_height - z * (sp + down * cp)
-            if z <= 0.0 or not LOWEST <= height <= HIGHEST:
-                continue
-            ahead, left = z * (cp - down * sp), -z * (column + 0.5 - centre_x) / focal_x
-            ahead, left = ct * ahead - st * left, st * ahead + ct * left
-            if ahead <= 0.0:
-                continue
-            index = int(math.floor((left / ahead - slopes[0]) / step + 0.5))
-            if 0 <= index < columns:
-                away = math.hypot(ahead, left)
-                if not found[index] <= away:
-                    found[index] = away
-    return found

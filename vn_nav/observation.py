@@ -155,6 +155,23 @@ def check_lens(across: float) -> None:
             'use another lens, or crop a wide picture and publish its own camera_info')
 
 
+def check_camera(fov: float, aspect: float, target_fov: float, *, any_lens: bool) -> None:
+    """Whether a policy can drive by a camera.
+
+    Args:
+        fov: of the picture's shorter side [rad]; aspect: its width over its height.
+        target_fov: that the policy was trained with [rad].
+        any_lens: it can be told how a lens magnifies, see `through_lens`.
+
+    Raises:
+        UserError: the camera sees too little or, with `any_lens`, too much.
+    """
+    if any_lens:
+        check_lens(fov_across(fov, aspect))
+    else:
+        crop_fraction(fov, target_fov)
+
+
 def crop_fraction(fov: float, target_fov: float) -> float:
     """Share of a picture's side that shows `target_fov`, for a pinhole camera with `fov` [rad].
 

@@ -69,6 +69,7 @@ AXES = ('dx', 'dy', 'dyaw', 'dpitch')
 NAME_LENGTH = 100  # characters
 MAX_ACTIONS = 256
 MAX_MOVE = 100.0  # m or rad, of an action
+MAX_TILT = math.radians(60.0)  # of the camera, either way
 SMALLEST = 1e-3  # of what is positive, in the field's unit
 # What no robot of ours goes beyond, in the field's unit: a slip of units or of a digit.
 LARGEST = {

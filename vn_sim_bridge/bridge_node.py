@@ -11,6 +11,7 @@ import importlib
 import json
 import sys
 import time
+from collections import deque
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -40,6 +41,7 @@ from vn_sim_bridge.bridge_sensors import Sensors
 from vn_sim_bridge.render.randomisation import load_randomisation
 from vn_sim_bridge.robot.goal_pictures import load_goal_pictures
 from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
+from vn_sim_bridge.simulator import Frames as Pictures
 from vn_sim_bridge.simulators import robot_for
 
 COMMAND_TIMEOUT_S = 0.5  # s of the bridge's own time without a command: the base brakes
@@ -76,15 +78,20 @@ class SimBridgeNode(Node):
         work = f'opening {scene}; the first start compiles the renderer, a minute'
         with compiling(self, ended, work):
             self.robot = SimulatedRobot(
-                scene, robot=robot, size=values['size'],
+                scene, robot=robot, size=values['size'], aspect=values['aspect'],
                 noise=values['noise'], seed=values['seed'],
                 max_decisions=values['max_decisions'], stop=values['stop'],
                 randomisation=load_randomisation(values['randomisation']),
                 odometry_drift=values['odometry_drift'],
                 goal_poses=[goal.pose for goal in self.goals] or None)
+        if self.lock_step and self.robot.randomisation.varies_time:
+            raise UserError('a base that is late is driven in real time',
+                            f'time:=lock_step with randomisation:={values["randomisation"]}',
+                            'set time to real_time, or leave out the delays')
         self.frames = Frames.with_prefix(values['frame_prefix'])
         self.start_ns = round(1e9 * first_stamp(
             values['start_time'], lock_step=self.lock_step, wall=time.time()))
+        self.begun = time.monotonic()  # when that stamp was
         self.command = np.zeros(4)
         self.command_tick = 0  # when the newest command came, in ticks
         self.command_at: float | None = None  # the same on the steady clock [s]
@@ -94,6 +101,7 @@ class SimBridgeNode(Node):
         # Pose from the goal_pose topic, for the next reset.
         self.next_goal: tuple[float, float, float] | None = None
         self.done = False
+        self._taken: deque[tuple[int, Time, Pictures]] = deque()  # pictures to publish
         self.says_arrived = self.goal_taken = False  # the policy, in this episode
         self.goal_shown = 0.0  # steady time [s]
         self._clock_publisher: Publisher | None = None  # made once nobody else has one
@@ -105,13 +113,17 @@ class SimBridgeNode(Node):
             f'ready: {scene}, {values["time"]}; pictures on '
             f'{self.resolve_topic_name("image_raw")}, waits for commands on '
             f'{self._listener.topic_name}')
-        self.begun = time.monotonic()
-        self._behind_said = 0
+        self._skipped = 0  # ticks that the clock went on without the world
+        self._lost_said = 0
+
+    def close(self) -> None:
+        """Let go of the simulator."""
+        if hasattr(self, 'robot'):
+            self.robot.close()
 
     def destroy_node(self) -> None:
         """Let go of the simulator as well."""
-        if hasattr(self, 'robot'):
-            self.robot.close()
+        self.close()
         super().destroy_node()
 
     def _other_clocks(self) -> list[str]:
@@ -156,8 +168,8 @@ class SimBridgeNode(Node):
             self.get_logger().info('no /tf: tf2_msgs is not installed')
         self._sensors = Sensors(
             {name: publisher(kind, name) for name, kind in kinds.items()}, self.robot,
-            self.frames, size=values['size'], period=self.picture_ticks * TICK,
-            localised=values['localised'], transform=TransformStamped)
+            self.frames, period=self.picture_ticks * TICK, localised=values['localised'],
+            transform=TransformStamped)
         self._label_names = publisher(String, 'labels/names') if can.labels else None
         self._collision = publisher(Bool, 'collision')
         self._scene = publisher(String, 'scene')
@@ -255,6 +267,7 @@ class SimBridgeNode(Node):
         else:
             self.robot.begin_episode(index, goal_pose)
         self.index = index
+        self._taken.clear()
         self.command = np.zeros(4)
         self.rest_ticks = -1  # its first picture waits for a tick, see `tick`
         self.says_arrived = self.goal_taken = False
@@ -281,7 +294,30 @@ class SimBridgeNode(Node):
     @property
     def moves(self) -> bool:
         """A velocity is asked for, or the base still brakes."""
-        return bool(self.command.any() or self.robot.velocity.any())
+        return bool(self.command.any() or self.robot.moves)
+
+    @property
+    def behind(self) -> int:
+        """Ticks by which the simulated time lags behind the wall clock."""
+        return 0 if self.lock_step else self._ticks_late(self.robot.tick_count, time.monotonic())
+
+    def _ticks_late(self, count: int, at: float) -> int:
+        """Whole ticks by which tick `count` is late at steady time `at` [s]."""
+        return max(0, int((at - self.begun) / TICK) - count - self._skipped)
+
+    def catch_up(self, next_tick: float) -> None:
+        """At rest, in real time: the clock goes on, so that the next tick is not late.
+
+        A robot that stands may have stood for longer. In motion no tick can be left out: pictures
+        and odometry stay late until it stands.
+
+        Args:
+            next_tick: steady time at which it comes [s].
+        """
+        late = self._ticks_late(self.robot.tick_count + 1, next_tick)
+        if late and not self.lock_step and not self.moves:
+            self._skipped += late
+            self.start_ns += late * TICK_NS
 
     def give_up_waiting(self) -> None:
         """In lock-step nobody has answered: the base brakes, and time goes on."""
@@ -299,7 +335,7 @@ class SimBridgeNode(Node):
         if self.continuous and camera_due and self.robot.in_decision:
             decision = self.robot.end_decision()
         stamp = self.stamp()
-        at_rest = not self.robot.velocity.any()
+        at_rest = not self.robot.moves
         self.rest_ticks = self.rest_ticks + 1 if at_rest else -1
         begun = decision is not None and self._judge(decision)
         # Who says that it has arrived is judged where it has come to rest.
@@ -311,7 +347,10 @@ class SimBridgeNode(Node):
         # After a jump to a new start the first picture waits for a tick, so that the new goal
         # arrives before it.
         if camera_due and not begun:
-            self._sensors.publish_pictures(stamp)
+            late = round(self.robot.camera_delay / TICK)
+            self._taken.append((self.robot.tick_count + late, stamp, self.robot.observe()))
+        while self._taken and self._taken[0][0] <= self.robot.tick_count:
+            self._sensors.publish_pictures(*self._taken.popleft()[1:])
         if self.robot.tick_count % self.picture_ticks == 0:
             self._sensors.publish_scan(stamp)
         self._sensors.publish_odometry(stamp)
@@ -344,23 +383,22 @@ class SimBridgeNode(Node):
     def _report(self) -> None:
         """Say on /diagnostics how the simulated robot does."""
         now = time.monotonic()
-        behind = 0 if self.lock_step else max(
-            0, int((now - self.begun) / TICK) - self.robot.tick_count)
+        lost = self.behind + self._skipped
         state = ('all episodes done' if self.done else 'free driving' if self.free else
                  f'episode {self.index} to {self.robot.goal.room}')
         level, summary = DiagnosticStatus.OK, state
-        if behind >= self._behind_said + LATE_TICKS:
+        if lost >= self._lost_said + LATE_TICKS:
             level, summary = DiagnosticStatus.WARN, (
-                f'{state}: {behind - self._behind_said} ticks of {TICK} s late since the last '
+                f'{state}: {lost - self._lost_said} ticks of {TICK} s late since the last '
                 'report: give it more time, smaller pictures or lock_step')
-        self._behind_said = behind
+        self._lost_said = lost
         if fault := self._misunderstandings():
             level, summary = DiagnosticStatus.ERROR, fault
             self.get_logger().error(fault, throttle_duration_sec=10.0)
         values = {
             'state': state, 'episode': self.index,
             'decisions': self.robot.episode.decisions if self.robot.episode else 0,
-            'moves': self.moves, 'ticks': self.robot.tick_count, 'ticks_behind': behind,
+            'moves': self.moves, 'ticks': self.robot.tick_count, 'ticks_behind': self.behind,
             'last_command_age': ('no command yet' if self.command_at is None else
                                  f'{now - self.command_at:.2f}')}
         message = DiagnosticArray(status=[DiagnosticStatus(
@@ -409,6 +447,7 @@ def run(node: SimBridgeNode, ended: Ended) -> None:
         if next_tick <= now:  # a late bridge still hears a stop
             for _ in range(OVERDUE_CALLBACKS):
                 executor.spin_once(timeout_sec=0)
+        node.catch_up(next_tick)
         while not ended.is_set():
             remaining = next_tick - time.monotonic()
             if remaining <= 0:

@@ -16,6 +16,7 @@ from vn_sim_bridge.bridge_messages import Frames, Transform
 from vn_sim_bridge.floor.places import walled
 from vn_sim_bridge.robot.simulated_robot import SimulatedRobot
 from vn_sim_bridge.simulator import Capabilities
+from vn_sim_bridge.simulator import Frames as Pictures
 
 # Topics of sensors that not every simulator has, by the capability that they need.
 NEEDS = {'depth/image_raw': 'depth', 'depth/camera_info': 'depth', 'labels/image_raw': 'labels',
@@ -36,17 +37,16 @@ class Sensors:
         publishers: of `topics`, and of /tf and /tf_static where there are any.
         robot: whose sensors they are.
         frames: names of its frames.
-        size: side of the pictures [pixels].
         period: between two scans [s].
         localised: /tf says where odom lies in the map.
         transform: makes an empty TransformStamped.
     """
 
     def __init__(self, publishers: Mapping[str, Any], robot: SimulatedRobot, frames: Frames, *,
-                 size: int, period: float, localised: bool, transform: Callable[[], Any]):
+                 period: float, localised: bool, transform: Callable[[], Any]):
         self._out, self._robot, self._frames = dict(publishers), robot, frames
         self._period, self._localised, self._transform = period, localised, transform
-        self._info = camera.fill_camera_info(self._make('camera_info'), size, size,
+        self._info = camera.fill_camera_info(self._make('camera_info'), *robot.picture_size,
                                              robot.robot.camera_fov)
         self._odometry, self._truth = self._make('odom'), self._make('ground_truth/odom')
 
@@ -60,9 +60,9 @@ class Sensors:
         message.header.stamp, message.header.frame_id = stamp, frame
         self._out[name].publish(message)
 
-    def publish_pictures(self, stamp: Any) -> None:
-        """Publish what the camera sees, in every form that somebody listens to."""
-        seen, frame = self._robot.observe(), self._frames.optical
+    def publish_pictures(self, stamp: Any, seen: Pictures) -> None:
+        """Publish what the camera saw at a time, in every form that somebody listens to."""
+        frame = self._frames.optical
         self._publish('camera_info', self._info, stamp, frame)
         rgb = np.ascontiguousarray(seen.rgb[0].transpose(1, 2, 0))
         self._publish('image_raw', images.fill_image(self._make('image_raw'), rgb), stamp, frame)

@@ -167,6 +167,7 @@ class Setup:
     size: int = 84  # side of the square pictures [pixels]
     threads: int = 1  # that draw
     randomisation: Randomisation | None = None  # of light and camera; None: nothing varies
+    goal_randomisation: Randomisation | None = None  # of goal pictures; None: the same
     models: tuple[str, ...] = ()  # names of the objects that `set_objects` places
     objects: int = 0  # most of them at a time
     goals_per_room: int = 1

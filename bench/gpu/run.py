@@ -7,7 +7,9 @@ Parts: `render` (agreement with the Numba renderer, rendering and environment ra
 (frames/s of whole training loops by preset and number of environments), `learn` (real trainings in
 one house, their curves and checkpoints) and `export` (what the GPU-trained weights say on the CPU
 and in ONNX Runtime). Where a command may take ten minutes only, `--parts render`, `--parts train`
-and `--parts learn export` fit into one each.
+and `--parts learn export` fit into one each. `--parts reproduce` runs the thesis's experiments at
+full size (docs/reproduce.md), and goes on where it was interrupted; `--experiments`, `--frames`
+and `--limit-minutes` say how much.
 
 Prints one JSON line a figure, with the hardware's name. Every part and preset is a process of its
 own: one that fails or takes too long leaves a line with its error, and the rest goes on. `--device
@@ -30,6 +32,8 @@ import torch
 from vn_nav.scenes import house_scenes
 
 PARTS = ('render', 'train', 'learn', 'export')
+REPRODUCE = 'reproduce'  # days of work: only where it is named
+EXPERIMENTS = ('fig5.4', 'fig5.5', 'fig5.6', 'fig5.7', 'ablation')
 PRESETS = ('a2c', 'unreal', 'thesis', 'fast')
 LEARNED = ('fast', 'thesis')
 ROUNDS = 7
@@ -43,7 +47,8 @@ def parse():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--device', default='cuda:0')
     parser.add_argument('--out', type=Path, help='also append the lines here')
-    parser.add_argument('--parts', nargs='+', choices=PARTS, default=list(PARTS))
+    parser.add_argument('--parts', nargs='+', choices=(*PARTS, REPRODUCE),
+                        default=list(PARTS))
     parser.add_argument('--limit-minutes', type=float, default=60.0, help='for everything')
     parser.add_argument('--envs', type=int, nargs='+', default=[64, 256, 1024, 4096, 16384],
                         help='of render')
@@ -56,6 +61,11 @@ def parse():
     parser.add_argument('--train-seconds', type=float, default=12.0, help='of each figure')
     parser.add_argument('--learn-envs', type=int, default=256)
     parser.add_argument('--learn-minutes', type=float, default=4.0, help='of each training')
+    parser.add_argument('--experiments', nargs='+', choices=EXPERIMENTS,
+                        default=list(EXPERIMENTS), help='of reproduce')
+    parser.add_argument('--frames', type=int, help="of a run of reproduce; default: the thesis's")
+    parser.add_argument('--runs', type=Path, default=Path('runs/reproduce'),
+                        help='folder of the runs of reproduce')
     parser.add_argument('--curves', type=Path, default=Path('bench/gpu/curves'),
                         help='folder for the curves and checkpoints of learn')
     parser.add_argument('--job', help=argparse.SUPPRESS)  # what a child process does
@@ -67,8 +77,9 @@ def jobs(arguments) -> list[str]:
     learned = [name for name in LEARNED if name in arguments.presets]
     found = {'render': ['render'], 'train': [f'train {name}' for name in arguments.presets],
              'learn': [f'learn {name}' for name in learned],
-             'export': [f'export {name}' for name in learned]}
-    return [job for part in PARTS if part in arguments.parts for job in found[part]]
+             'export': [f'export {name}' for name in learned],
+             REPRODUCE: [f'{REPRODUCE} {name}' for name in arguments.experiments]}
+    return [job for part in found if part in arguments.parts for job in found[part]]
 
 
 def hardware(device: str) -> str:
@@ -314,7 +325,8 @@ def onnx_says(checkpoint, rows, goals) -> np.ndarray:
     """The logits of exported files."""
     import onnxruntime
 
-    from vn_nav.policy.export import GOAL, POLICY, export_onnx
+    from vn_nav.policy.checkpoint_info import GOAL, POLICY
+    from vn_nav.policy.export import export_onnx
     with tempfile.TemporaryDirectory() as folder:
         export_onnx(checkpoint, folder)
         goal, policy = (onnxruntime.InferenceSession(
@@ -335,12 +347,25 @@ def onnx_says(checkpoint, rows, goals) -> np.ndarray:
     return np.array(logits)
 
 
+# Part reproduce.
+
+def reproduce(arguments, name: str):
+    """An experiment of the thesis at full size: pages and curves beside those of `learn`."""
+    words = [] if arguments.frames is None else ['--frames', str(arguments.frames)]
+    results = arguments.curves / REPRODUCE
+    subprocess.run([sys.executable, '-m', 'vn_nav.cli', 'reproduce', name, '--full', '--device',
+                    arguments.device, '--out', str(arguments.runs), '--results', str(results),
+                    *words], check=True)
+    say(arguments, f'reproduced: {name}', None, '', f'figures in {results}')
+
+
 def main():
     """Run the jobs as children, each within what is left of the time."""
     arguments = parse()
     if arguments.job:
         part, _, name = arguments.job.partition(' ')
-        work = {'render': render, 'train': training, 'learn': learn, 'export': export}[part]
+        work = {'render': render, 'train': training, 'learn': learn, 'export': export,
+                REPRODUCE: reproduce}[part]
         work(arguments, *([name] if name else []))
         return
     begun, failed = time.monotonic(), 0

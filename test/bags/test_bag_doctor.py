@@ -249,6 +249,23 @@ def test_the_command_prints_a_table_and_writes_json(tmp_path, capsys):
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
+def test_the_doctor_of_graphs_looks_at_bags_too(tmp_path, capsys):
+    path = write(tmp_path / 'a.mcap', changed(drive(), '/odom', still))
+    page, figures = tmp_path / 'page.html', tmp_path / 'figures.json'
+    words = ['--html', str(page), '--json', str(figures)]
+    assert cli.main(['doctor', '--bag', str(path), *words]) == 1
+    assert 'error: /odom never moves' in capsys.readouterr().out
+    assert '/odom never moves' in page.read_text()
+    assert json.loads(figures.read_text())['usable'] is False
+    sound = write(tmp_path / 'b.mcap', drive())
+    assert cli.main(['doctor', '--bag', str(sound), '--strict', *words]) == 0
+    assert 'Nothing is wrong' in page.read_text()
+    # No camera_info: a warning.
+    bare = write(tmp_path / 'c.mcap', changed(drive(), '/camera_info', gone))
+    assert cli.main(['doctor', '--bag', str(bare)]) == 0
+    assert cli.main(['doctor', '--bag', str(bare), '--strict']) == 1
+
+
 def test_commands_alone_serve_and_a_robot_that_is_never_told_to_move_is_found(tmp_path):
     sent = changed(changed(drive(), '/odom', gone), '/cmd_vel', as_type(TWIST, twist(0.0)))
     found = diagnose(write(tmp_path / 'a.mcap', sent))

@@ -1,10 +1,21 @@
 """What a policy is shown of a recorded drive, and when."""
 
 
+import dataclasses
+
 import numpy as np
 import pytest
-from shadow_drives import FOREIGN, NAMES, ROBOT, STORE, two_drives
-from small_bags import FIXTURE, IMAGE, ODOMETRY, START, drive, odometry, write
+from shadow_drives import (
+    FOREIGN,
+    NAMES,
+    ROBOT,
+    SCAN,
+    SPEED,
+    STORE,
+    scanned_drive,
+    two_drives,
+)
+from small_bags import FIXTURE, IMAGE, INFO, ODOMETRY, START, drive, odometry, picture, write
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags.dataset import Wanted
@@ -12,6 +23,7 @@ from vn_nav.bags.drive_cache import load_drives
 from vn_nav.bags.roles import Topics, load_topics
 from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.shadow.plan import make_plan, stamped
+from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS
 
 
@@ -40,7 +52,7 @@ def test_another_robot_with_compressed_pictures_and_no_goal(tmp_path):
     assert plan.compressed and plan.goals.hindsight == 1 and plan.goals.shown == 0
     *_, last = [e for e in plan.events() if e is not None and e.decision is not None]
     message = STORE.deserialize_cdr(last.data, 'sensor_msgs/msg/CompressedImage')
-    assert np.array_equal(plan.goals.picture(0), decode_rgb(message))
+    assert np.array_equal(plan.goals.picture(0).picture, decode_rgb(message))
     grey = np.full((8, 8, 3), 128, np.uint8)
     given = make_plan(FOREIGN, ROBOT, load_topics(tmp_path / 'topics.yaml'), grey)
     assert given.goals.picture(0) is grey and given.goals.hindsight == 0
@@ -81,3 +93,59 @@ def test_a_stamp_is_replaced_in_place():
     back = STORE.deserialize_cdr(stamped(bytes(message), 7_000_000_008), ODOMETRY)
     assert (back.header.stamp.sec, back.header.stamp.nanosec) == (7, 8)
     assert back.pose.pose.position.x == 1.5 and back.header.frame_id == 'base_link'
+
+
+SCANS = dataclasses.replace(Topics(), scan='scan')
+
+
+def decided(plan):
+    return [event for event in plan.events() if event and event.decision]
+
+
+def test_the_nearest_scan_belongs_to_a_picture_also_when_it_was_recorded_later(tmp_path):
+    messages = scanned_drive()
+    bag = write(tmp_path / 'bag.mcap', messages)
+    plan = make_plan(bag, ROBOT, SCANS, ranges='scan')
+    events = decided(plan)
+    assert plan.ranges == '/scan' and len(events) >= 3
+    for event in events:  # 30 ms later, and not the one 70 ms before
+        assert event.ranges.stamp - event.stamp == 30_000_000
+        where = SPEED * (event.ranges.stamp - START) * 1e-9
+        assert event.ranges.pose == pytest.approx((where, 0.0, 0.0), abs=1e-6)
+        message = STORE.deserialize_cdr(event.ranges.data, SCAN)
+        assert message.header.stamp.nanosec == event.ranges.stamp % 10**9
+    assert all(event.ranges is None for event in decided(make_plan(bag, ROBOT, SCANS)))
+    # Where the nearest is too far off in time there is none.
+    late = [m for m in messages if m[0] != '/scan' or m[2] > START + 2 * 10**9]
+    held = [event.ranges is not None for event in decided(make_plan(
+        write(tmp_path / 'late.mcap', late), ROBOT, SCANS, ranges='scan'))]
+    assert not held[0] and held[-1]
+
+
+def test_scans_of_a_clock_that_was_set_back_are_stamped_as_the_pictures_are(tmp_path):
+    one = scanned_drive()
+    two = []
+    for name, kind, log_time, message in scanned_drive():
+        if hasattr(message, 'header'):
+            message.header.stamp.sec -= 1000
+        two.append((name, kind, log_time + 10 * 10**9, message))
+    events = decided(make_plan(write(tmp_path / 'bag.mcap', one + two), ROBOT, SCANS,
+                               ranges='scan'))
+    assert {event.decision.episode for event in events} == {0, 1}
+    assert [event.ranges.stamp - event.stamp for event in events] == [30_000_000] * len(events)
+
+
+def test_depth_pictures_come_with_their_camera_info(tmp_path):
+    messages = [m for m in scanned_drive() if m[0] != '/scan']
+    depth = [('/depth/image_raw', IMAGE, time, picture(
+        time - 5_000_000, np.full((8, 8), 2.0, np.float32), '32FC1'))
+        for name, _, time, _ in messages if name == '/image_raw']
+    info = [('/depth/camera_info', INFO, time, message)
+            for name, _, time, message in messages if name == '/camera_info']
+    plan = make_plan(write(tmp_path / 'bag.mcap', messages + depth + info), ROBOT, Topics(),
+                     ranges='depth')
+    assert plan.ranges == '/depth/image_raw' and plan.depth_info is not None
+    assert all(event.ranges.stamp == event.stamp for event in decided(plan))
+    with pytest.raises(UserError, match='camera_info'):
+        make_plan(write(tmp_path / 'none.mcap', messages + depth), ROBOT, Topics(),
+                  ranges='depth')

@@ -65,6 +65,17 @@ def _config(folder):
     (['train', '--resume', '--out', 'OUT'], 'resume'),
     (['demo', '--checkpoint', '/nowhere', '--out', 'OUT'], 'checkpoint'),
     (['demo', '--episodes', '0', '--out', 'OUT'], 'episode'),
+    (['doctor', '--seconds', '0'], '--seconds'),
+    (['doctor', '--checkpoint', '/nowhere'], 'checkpoint'),
+    (['doctor', '--robot', '/nowhere'], 'robot file'),
+    (['doctor', '--topics', '/nowhere'], 'YAML file'),
+    (['doctor', '--set', 'seed'], 'NAME=VALUE'),
+    (['doctor', '--set', 'seed=1'], 'the doctor uses'),
+    (['doctor', '--set', 'max_frame_age=far'], 'max_frame_age'),
+    (['doctor', '--set', 'use_sim_time=1'], 'true or false'),
+    (['doctor', '--html', 'OUT/page.html'], 'folder'),
+    (['doctor', '--bag', '/nowhere'], 'bag'),
+    (['doctor', '--bag', 'bags/house_drive', '--base-check'], 'without a graph'),
 ])
 def test_bad_input_is_one_line(tmp_path, capsys, words, expected):
     out = tmp_path / 'out'

@@ -12,9 +12,9 @@ from vn_nav.cli.world import make_env, make_env_for
 from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import PolicyActor
 from vn_nav.evaluation.measurement import odometry_for
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.network import Policy
-from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.search.driver import SearchDriver
 from vn_nav.policy.search.local_features import SIDE, extract
 from vn_nav.policy.search.searcher import Searcher

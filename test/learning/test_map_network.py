@@ -13,7 +13,7 @@ from small_env import make
 from small_search import small_search, write_small_search
 
 from vn_nav.evaluation.evaluator import PolicyActor, run_episodes
-from vn_nav.policy.runtime import BatchedPolicy
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.search.grid import CELL, OccupancyGrid
 from vn_nav.policy.search.hypotheses import Hypotheses
 
@@ -195,6 +195,7 @@ def test_reinforcement_prefers_what_was_paid(learning, drive):
     assert all(math.isfinite(value) for value in figures.values())
 
 
+@pytest.mark.slow
 def test_what_rests_does_not_change_what_the_others_do(learning, drive):
     """Episodes as `PolicyActor` drives them; an environment with enough of them is left alone."""
     threshold = float(np.quantile([told.arrival for _, told, _, _ in drive[0]], 0.8))
@@ -208,6 +209,7 @@ def test_what_rests_does_not_change_what_the_others_do(learning, drive):
     env.close()
 
 
+@pytest.mark.slow
 def test_one_command_trains_measures_and_goes_on_where_it_was(learning, monkeypatch, capsys,
                                                               tmp_path):
     monkeypatch.syspath_prepend(ROOT / 'bench')

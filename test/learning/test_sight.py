@@ -30,8 +30,8 @@ from vn_nav.learning.sight_training import SightConfig, begin_with, train_sight
 from vn_nav.learning.state_file import read_state
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network_config import NetworkConfig
-from vn_nav.policy.search.look import BINS, COLUMNS, column_bearings
-from vn_nav.policy.search.network import Recognition, SearchPolicy
+from vn_nav.policy.search.look import BINS, COLUMNS, Recognition, column_bearings
+from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.report.sight_page import sight_page
 from vn_nav.robot import RobotSpec

@@ -13,6 +13,7 @@ from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.policy.search.key_pictures import KeyPictures
 from vn_nav.policy.search.taught import TaughtPlace
+from vn_nav.policy.search.torch_eyes import TorchEyes
 
 SEARCH = 'models/search'
 pytestmark = pytest.mark.timeout(400)  # one run of the command, for all of them
@@ -59,13 +60,13 @@ def test_it_is_measured_on_goals_that_are_no_key_pictures(taught):
 
 def test_it_knows_where_pictures_between_the_key_pictures_were_taken(taught, driven):
     network = load_checkpoint(taught / 'checkpoint').network
-    keys = KeyPictures(network, network.taught)
+    keys = KeyPictures(TorchEyes(network), network.taught)
     known = {picture.tobytes() for picture in network.taught.pictures}
     poses, pictures = driven
     rows = [k for k in range(60, len(poses), 23) if pictures[k].tobytes() not in known]
     off = []
     for row in rows:
-        found, _ = keys.recognise(torch.from_numpy(pictures[row:row + 1]), None)
+        found, _ = keys.recognise(pictures[row:row + 1], None)
         gap = np.hypot(*(found[0].pose[:2] - poses[row, :2])) if found else np.inf
         turn = abs(wrap_angle(found[0].pose[2] - poses[row, 2])) if found else np.inf
         off.append((gap, np.degrees(turn)))

@@ -5,6 +5,7 @@ VN_NAV_PICTURE_MUTATIONS=100000 is the long form (`make soak`).
 """
 
 import json
+import math
 import os
 import random
 import struct
@@ -24,9 +25,10 @@ from paths import TESTS
 from picture_bytes import chunk, encoded, jpeg, photo, png, segment, with_exif
 from small_bags import START, make, write
 
+from vn_msgs_py.exif import read_exif
 from vn_msgs_py.image_error import ForeignFormatError, ImageError
 from vn_msgs_py.images import decode_rgb
-from vn_msgs_py.picture_file import decode_picture
+from vn_msgs_py.picture_file import decode_picture, decode_with_lens
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.goal_picture import KEPT_SIDE_PX, MAX_JPEG_PX
 
@@ -128,6 +130,27 @@ def test_broken_exif_is_no_fault_of_the_pixels(files):
                     else file[:33] + chunk(b'eXIf', data) + file[33:])
             assert np.array_equal(decode_picture(held), decode_picture(file))
     assert plain.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize('suffix', ['.jpg', '.png'])
+@pytest.mark.parametrize('order', '<>')
+def test_a_picture_says_how_wide_its_lens_is(suffix, order):
+    plain = encoded(photo(480, 640), suffix)
+    assert decode_with_lens(plain).fov is None
+    for orientation, smallest in ((1, None), (6, None), (6, 100)):
+        file = with_exif(plain, orientation, order, 26)
+        picture, fov = decode_with_lens(file, smallest=smallest)
+        # By the diagonal of 24 x 36 mm; the shorter side is 3 of 5.
+        wanted = 2 * math.atan(math.hypot(24, 36) / 2 / 26 * 0.6)
+        assert fov == pytest.approx(wanted) and math.degrees(fov) == pytest.approx(53.06, abs=0.01)
+        assert np.array_equal(picture, decode_picture(file, smallest=smallest))
+    for nonsense in (0, 1, 65535):
+        assert decode_with_lens(with_exif(plain, 1, order, nonsense)).fov is None
+    data = picture_bytes.lens_exif(6, 26, order)
+    for end in range(len(data)):  # cut anywhere, or pointing anywhere
+        read_exif(data[:end])
+    for place in range(8, len(data)):
+        read_exif(data[:place] + b'\xff\xff\xff\xff' + data[place + 4:])
 
 
 def test_bytes_behind_the_end_are_somebody_elses(files):

@@ -156,6 +156,21 @@ def test_standing_at_the_wrong_picture_is_told():
     assert told[:8].all() and not told[8:].any()
 
 
+@pytest.mark.parametrize('options, moves, turns', [
+    ({}, True, True), ({'turn_noise': False}, True, False), ({'noise': 0.0}, False, False)])
+def test_motion_noise_is_of_moves_and_turns_of_moves_alone_or_none(options, moves, turns):
+    """The thesis has noise along the movement alone in its 5.6."""
+    env = make(num_envs=32, **options)
+    for action, noisy in (('forward', moves), ('rotate_left', turns)):
+        env.reset(seed=0)
+        before = env.simulator.poses.copy()
+        info = env.step(np.full(32, env.action_names.index(action)))[4]
+        moved = np.hypot(*(env.simulator.poses - before)[:, :2].T) if action == 'forward' else (
+            np.angle(np.exp(1j * (env.simulator.poses - before)[:, 2])))
+        free = moved[~info['collided']]
+        assert len(free) >= 8 and (free.std() > 1e-3) == noisy
+
+
 def test_a_robot_that_sees_its_goal_pose_sees_the_goal_picture():
     env = make(size=84, num_envs=2)
     observation, info = env.reset(seed=0)

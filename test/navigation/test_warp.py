@@ -76,6 +76,8 @@ def test_episodes_agree_with_the_environment(mode):
     config = EnvConfig(
         scenes=house_scenes((7, 3, 12_001), 4), num_envs=24, size=48, max_decisions=20,
         progress_reward=1.0, collision_reward=-0.1, randomisation=randomisation,
+        noise=2.0 if mode == 'wrong' else 1.0,
+        goal_randomisation=load_randomisation('standard') if mode == 'right' else None,
         actions=('forward', 'backward', 'rotate_left', 'rotate_right', 'left', 'look_up'))
     host, device = NavigationEnv(config), WarpNavigationEnv(config, device='cpu')
     goals = np.abs(host.goals.astype(int) - device.goals.numpy().astype(int))

@@ -18,8 +18,18 @@ from geometry_msgs.msg import Twist
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from ros_harness import wait_until, write_checkpoint
-from shadow_drives import BASE, FOREIGN, NAMES, ROBOT, STORE, two_drives
+from shadow_drives import (
+    BASE,
+    FOREIGN,
+    NAMES,
+    ROBOT,
+    STORE,
+    WALLS,
+    scanned_drive,
+    two_drives,
+)
 from small_bags import FIXTURE, ODOMETRY, START, drive, odometry, write
+from small_search import write_small_search
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags.dataset import Wanted
@@ -62,12 +72,27 @@ def test_what_cannot_be_driven_is_one_line(tmp_path, capsys):
             ([wrong], 'sensor_msgs/msg/Image'), ([blind], '--topics'), ([narrow], 'deg'),
             ([FIXTURE, '--goal', text], 'goal.png'), ([FIXTURE, '--robot', text], 'robot'),
             ([FIXTURE, '--compare', tmp_path], 'config.json'),
+            ([FIXTURE, '--scan-topic', 'scan'], 'search with a map'),
             ([FIXTURE, '--out', tmp_path], 'folder of its own')):
         out = [] if '--out' in words else ['--out', tmp_path / 'out']
         code = main(['bag', 'drive', *map(str, [*words, *out]), '--checkpoint', checkpoint])
         error = capsys.readouterr().err
         assert code == 2 and error.count('\n') == 1, error
         assert expected in error
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_policy_with_a_map_takes_other_cameras_and_ranges_that_are_there(tmp_path, capsys):
+    checkpoint = str(write_small_search(tmp_path / 'policy'))
+    scanned = write(tmp_path / 'scanned.mcap', scanned_drive(40.0))
+    for words, expected in (
+            ([FIXTURE, '--scan-topic', 'front/scan'], 'front/scan'),
+            ([FIXTURE, '--scan-topic', 'odom'], 'LaserScan'),
+            ([scanned], '50 to 120 deg')):
+        assert main(['bag', 'drive', *map(str, words), '--checkpoint', checkpoint, '--out',
+                     str(tmp_path / 'out')]) == 2
+        error = capsys.readouterr().err
+        assert error.count('\n') == 1 and expected in error, error
     assert not (tmp_path / 'out').exists()
 
 
@@ -231,9 +256,51 @@ def test_two_episodes_by_commands_alone(tmp_path, capfd):
     shown = list(read_bag(tmp_path / 'out', ('shadow/goal_image',)))
     assert len(shown) == 2
     for episode, record in enumerate(shown):
-        assert np.array_equal(decode_rgb(record.message), plan.goals.picture(episode))
+        assert np.array_equal(decode_rgb(record.message), plan.goals.picture(episode).picture)
     said = [r.message.data for r in read_bag(tmp_path / 'out', ('shadow/arrived',))]
     assert sum(said) == len(answers) and said[-1]
+
+
+def last_map(folder):
+    """Percent of an obstacle at places on the map after the last decision, -1: unknown."""
+    message = list(read_bag(folder, ('shadow/policy_node/map',)))[-1].message
+    cells = np.array(message.data, np.int8).reshape(message.info.height, message.info.width)
+    origin = message.info.origin
+    yaw = 2 * math.atan2(origin.orientation.z, origin.orientation.w)
+    c, s = math.cos(yaw), math.sin(yaw)
+
+    def at(x, y):
+        x, y = x - origin.position.x, y - origin.position.y
+        return cells[int((c * y - s * x) / message.info.resolution),
+                     int((c * x + s * y) / message.info.resolution)]
+    return at
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_map_takes_the_scans_of_the_bag(tmp_path, capfd):
+    """Of a narrow camera whose pictures show nothing: the wall ahead is in the scans alone."""
+    bag = write(tmp_path / 'bag.mcap', scanned_drive())
+    checkpoint = write_small_search(tmp_path / 'policy')
+    arguments = ['bag', 'drive', str(bag), '--checkpoint', str(checkpoint)]
+    with_scans = ['--scan-topic', 'scan', '--scan-x', '0.1', '--scan-yaw', str(math.pi)]
+    assert main([*arguments, '--out', str(tmp_path / 'seen')]) == 0
+    assert 'measured' not in capfd.readouterr().out
+    for name in ('measured', 'again'):
+        assert main([*arguments, *with_scans, '--out', str(tmp_path / name)]) == 0
+    decisions = len(read_shadow(tmp_path / 'measured').answers)
+    assert decisions >= 3 and f'measured ranges at {decisions} of' in capfd.readouterr().out
+    # By odometry, whose frame begins where the robot did.
+    seen, measured = (last_map(tmp_path / name) for name in ('seen', 'measured'))
+    wall = [(WALLS[0], y) for y in np.arange(-1.2, 1.21, 0.1)]
+    known = [[max(at(x + off, y) for off in (-0.1, 0.0, 0.1)) > 80 for x, y in wall]
+             for at in (seen, measured)]
+    assert np.mean(known[0]) < 0.2 and np.mean(known[1]) > 0.9
+    inside = [measured(x, y) for x in np.arange(0.5, 2.6, 0.3) for y in np.arange(-1.2, 1.3, 0.3)]
+    assert all(0 <= cell < 40 for cell in inside)
+    assert said_in(tmp_path / 'again') == said_in(tmp_path / 'measured')
+    assert_every_reader_accepts(tmp_path / 'measured')
 
 
 @pytest.fixture

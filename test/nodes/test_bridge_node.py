@@ -319,6 +319,55 @@ def test_a_restarted_bridge_shows_a_goal_with_another_stamp(listener, tmp_path):
     assert abs(stamps[0][0] - time.time()) < 300 and stamps[3][0] < 86_400
 
 
+def test_a_robot_that_stands_is_never_late(listener, tmp_path):
+    def age():
+        return time.time() - odometry_to_array(listener.heard['odom'][-1])[6]
+    with child(BRIDGE, tmp_path / 'log', house=7) as bridge:
+        listener.hears('odom', 1)
+        wait_until(lambda: age() < 0.5, listener.spin)
+        bridge.send_signal(signal.SIGSTOP)
+        listener.pause(1.5)
+        assert age() > 1.0
+        bridge.send_signal(signal.SIGCONT)
+        wait_until(lambda: age() < 0.5, listener.spin, what='its stamps are those of the present')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('aspect, size', [(4 / 3, (64, 48)), (0.75, (48, 64))])
+def test_a_camera_of_another_format(listener, tmp_path, aspect, size):
+    with child(BRIDGE, tmp_path / 'log', house=7, size=48, aspect=aspect):
+        seen, info = listener.hears('image_raw', 1), listener.hears('camera_info', 1)
+        goal = listener.hears('goal_image', 1)
+    assert (seen.width, seen.height) == (info.width, info.height) == (goal.width, goal.height)
+    assert (seen.width, seen.height) == size
+    assert info.k[0] == pytest.approx(24)  # 90 deg along the shorter side
+
+
+def test_a_base_that_is_late_is_no_robot_in_lock_step(listener, tmp_path):
+    with child(BRIDGE, tmp_path / 'log', house=7, time='lock_step',
+               randomisation='harsh') as bridge:
+        assert bridge.wait(PATIENCE) == 2
+    assert 'real_time' in (tmp_path / 'log').read_text().strip().splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_late_pictures_have_the_stamps_of_when_they_were_taken(listener, tmp_path):
+    late = tmp_path / 'late.yaml'
+    late.write_text('camera_delay: [0.4, 0.4]\n')
+    with child(BRIDGE, tmp_path / 'log', house=7, randomisation=str(late)):
+        behind = []
+
+        def look():
+            count = len(listener.heard['image_raw'])
+            listener.spin()
+            if len(listener.heard['image_raw']) > count and listener.heard['odom']:
+                stamp = listener.heard['image_raw'][-1].header.stamp
+                now = odometry_to_array(listener.heard['odom'][-1])[6]
+                behind.append(now - stamp.sec - 1e-9 * stamp.nanosec)
+        wait_until(lambda: len(behind) >= 10, look)
+    assert 0.3 < np.median(behind) < 1.5, behind  # a loaded machine hears late
+
+
 @pytest.mark.slow
 def test_two_bridges_have_a_clock_each_or_the_second_refuses(listener, tmp_path):
     clocks = {name: [] for name in ('/clock', '/robot2/clock')}

@@ -51,3 +51,11 @@ def test_nothing_activates_the_node_behind_an_operators_back():
     for path in FILES:
         assert 'TRANSITION_ACTIVATE' not in path.read_text()
         assert 'OnStateTransition' not in path.read_text()
+
+
+def test_a_parameter_that_two_nodes_share_means_the_same_in_both():
+    """In config/policy.yaml the key /**: gives every node the same value."""
+    from vn_nav.nodes import policy_parameters
+    from vn_sim_bridge import bridge_parameters
+    shared = set(policy_parameters.PARAMETERS) & set(bridge_parameters.PARAMETERS)
+    assert shared == {'enable_stamped_cmd_vel', 'mode', 'robot', 'seed', 'time'}

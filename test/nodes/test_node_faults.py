@@ -52,7 +52,7 @@ def test_odometry_of_another_type_or_without_a_word_refuses_to_enable(checkpoint
         assert 'geometry_msgs/msg/PoseStamped' in robot.refusal()
         robot.node.destroy_publisher(other)
         silent = robot.node.create_publisher(Odometry, 'odom', RELIABLE)
-        wait_until(lambda: 'nothing of it has come' in robot.refusal(), robot.spin)
+        robot.refuses('nothing of it has come')
         robot.node.destroy_publisher(silent)
         robot.enable()
         robot.says('actions run on time alone')
@@ -63,8 +63,7 @@ def test_required_odometry_is_waited_for(checkpoint, tmp_path):
                         robot={'odometry': RELIABLE}) as (robot, _):
         robot.sends.discard('odom')
         robot.show_goal()
-        robot.spin_for(1.5)
-        assert 'odometry' in robot.refusal()
+        robot.refuses('odometry')
         robot.sends.add('odom')
         robot.enable()
 
@@ -108,9 +107,7 @@ def test_without_a_clock_it_does_not_become_active(checkpoint, tmp_path):
                         robot={'odometry': RELIABLE, 'sim_time': True}) as (robot, _):
         robot.sends.discard('clock')
         robot.show_goal()
-        robot.spin_for(2.0)
-        refusal = robot.refusal()
-        assert 'not active' in refusal and '/clock' in refusal
+        robot.refuses('not active', '/clock')
         robot.sends.add('clock')
         robot.enable()
 
@@ -155,7 +152,7 @@ def test_an_unusable_goal_is_refused_with_the_reason(checkpoint, tmp_path):
         message = robot.picture(0)
         message.encoding = 'nonsense'
         robot.goal.publish(message)
-        wait_until(lambda: 'nonsense' in robot.refusal(), robot.spin)
+        robot.refuses('nonsense')
         assert 'goal_image' in robot.refusal()
         robot.drive()
         heard = len(robot.arrived)
@@ -171,6 +168,7 @@ def test_another_goal_with_the_old_stamp_is_another_goal(checkpoint, tmp_path):
         stamp = robot.stamp()
         robot.show_goal(0, stamp)
         robot.enable()
+        wait_until(lambda: robot.arrived, robot.spin)
         robot.spin_for(0.5)
         answers = len(robot.arrived)
         robot.show_goal(0, stamp)
@@ -184,12 +182,9 @@ def test_a_camera_on_another_clock_is_named_with_the_cure(checkpoint, tmp_path):
     with robot_and_node(checkpoint, tmp_path) as (robot, _):
         robot.offset = -37.0
         robot.show_goal()
-        robot.spin_for(1.5)
-        refusal = robot.refusal()
-        assert '37.0' in refusal and all(
-            word in refusal for word in ('use_sim_time', 'NTP', 'max_frame_age'))
+        robot.refuses('37.0', 'use_sim_time', 'NTP', 'max_frame_age')
         robot.offset = 12.0
-        wait_until(lambda: 'max_frame_ahead' in robot.refusal(), robot.spin)
+        robot.refuses('max_frame_ahead')
 
 
 def test_messages_that_no_camera_sends_end_no_thread(checkpoint, tmp_path):
@@ -319,9 +314,13 @@ def test_continuous_stops_when_odometry_falls_silent_in_motion(checkpoint, tmp_p
 def test_the_diagnostics_name_rates_and_latency(checkpoint, tmp_path):
     with robot_and_node(checkpoint, tmp_path, robot={'odometry': RELIABLE}) as (robot, _):
         robot.drive()
-        robot.spin_for(3.0)
-        values = robot.statuses[-1][3]
-        assert 20 < float(values['frame_rate_hz']) < 40
-        assert 30 < float(values['odometry_rate_hz']) < 60
-        assert 0 < float(values['inference_ms']) < 100
-        assert float(values['frame_age_ms']) < 250
+
+        def sound():
+            values = robot.statuses[-1][3]
+            if 'unknown' in values.values():
+                return False
+            return (20 < float(values['frame_rate_hz']) < 40
+                    and 30 < float(values['odometry_rate_hz']) < 60
+                    and 0 < float(values['inference_ms']) < 100
+                    and float(values['frame_age_ms']) < 250)
+        wait_until(sound, robot.spin)  # rates are of the last seconds

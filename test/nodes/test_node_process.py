@@ -18,7 +18,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 NODES = {'goal_node': 'vn_nav.nodes.goal_node', 'policy_node': 'vn_nav.nodes.policy_node',
          'recorder_node': 'vn_nav.nodes.recorder_node',
-         'sim_bridge_node': 'vn_sim_bridge.bridge_node'}
+         'sim_bridge_node': 'vn_sim_bridge.bridge_node',
+         'teleop_node': 'vn_nav.nodes.teleop_node'}
 ENDING = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT]
 EXECUTABLE = 'import sys; sys.argv[0] = "node"; from vn_nav.cli import nodes; ' \
     'sys.exit(nodes.{}())'
@@ -58,6 +59,8 @@ def test_help_is_printed_and_nothing_starts(name, tmp_path):
     ('sim_bridge_node', ['-p', 'hous:=7'], 'did you mean house?'),
     ('recorder_node', ['-p', 'max_bag_size:=20.0'], 'whole number'),
     ('recorder_node', ['-p', 'topics:=odom'], 'list'),
+    ('teleop_node', ['-p', 'speed:=2.0'], 'between 0.05 and 1.0'),
+    ('teleop_node', ['-p', 'source:=mouse'], 'auto, keyboard, joy'),
     ('recorder_node', ['-p', 'outptu:=x'], 'did you mean output?'),
     ('goal_node', ['-p', 'picture:=5'], 'text'),
     ('goal_node', ['-p', 'use_sim_time:=5'], 'use_sim_time'),

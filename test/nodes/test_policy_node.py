@@ -13,6 +13,7 @@ import rclpy
 from fake_robot import FakeRobot
 from geometry_msgs.msg import Twist
 from ros_harness import child, wait_until, write_checkpoint
+from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.errors import UserError
@@ -145,7 +146,7 @@ def test_a_second_publisher_and_a_narrow_camera_are_refused(robot, checkpoint, t
         robot.focal = 84.0  # 53 degrees where the policy needs 90
         robot.show_goal()
         # Not for what is not there yet.
-        wait_until(lambda: 'deg' in robot.refusal(), robot.spin)
+        robot.refuses('deg')
         robot.focal = 42.0
         robot.enable()
         wait_until(robot.moving, robot.spin)
@@ -166,7 +167,7 @@ def test_a_policy_that_searches_drives_by_a_narrow_wide_format_camera(tmp_path):
         with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=checkpoint):
             robot.focal = 80 / math.tan(math.radians(20))  # 40 deg across
             robot.show_goal()
-            wait_until(lambda: 'horizontally' in robot.refusal(), robot.spin)
+            robot.refuses('horizontally')
             robot.focal = 80 / math.tan(math.radians(30))
             robot.enable()
             wait_until(robot.moving, robot.spin)
@@ -189,3 +190,28 @@ def test_bad_input_is_one_line_and_exit_code_2(parameters, word):
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert word in done.stderr and 'received' in done.stderr
+
+
+def test_a_fisheye_camera_drives_and_an_uncalibrated_one_does_not(checkpoint, tmp_path):
+    rclpy.init()
+    robot = FakeRobot((160, 120))
+    lens = CameraInfo(width=160, height=120, distortion_model='equidistant',
+                      d=[-0.02, 0.004, -0.002, 0.0003],
+                      k=[51.0, 0.0, 80.0, 0.0, 51.0, 59.0, 0.0, 0.0, 1.0])
+    try:
+        with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=checkpoint):
+            robot.focal = 0.0
+            robot.show_goal()
+            robot.refuses('not calibrated')
+            robot.info.publish(lens)
+            robot.enable()
+            wait_until(robot.moving, robot.spin)
+            *_, values = robot.says('equidistant, rectified')
+            assert float(values['camera_fov_deg']) == pytest.approx(120.0, abs=0.5)
+            robot.size = (160, 160)  # pictures of another format than the camera's
+            robot._pictures = 16 * [np.zeros((160, 160, 3), np.uint8)]
+            robot.wait_for_zero()
+            robot.says("camera_info has the pictures' format")
+    finally:
+        robot.close()
+        rclpy.shutdown()

@@ -21,10 +21,11 @@ from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import fill_odometry
 from vn_nav.arrival import wrap_angle
 from vn_nav.errors import UserError
+from vn_nav.measured_ranges import RangeSource
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.map_output import MapOutput
 from vn_nav.nodes.qos import qos
-from vn_nav.nodes.range_input import RangeInput, RangeSource
+from vn_nav.nodes.range_input import RangeInput
 from vn_nav.policy.navigator import Limits, Navigator
 from vn_nav.policy.search.grid import CELL
 from vn_nav.resources import share_file

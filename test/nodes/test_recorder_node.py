@@ -239,8 +239,8 @@ def test_what_is_published_is_recorded_as_it_is_published(talker, tmp_path):
     assert sum(1 for _ in read_bag(tmp_path / 'named')) == 40
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, pytest.param(
-    signal.SIGHUP, marks=pytest.mark.slow), signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, *(
+    pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGHUP, signal.SIGTERM))])
 def test_every_recorder_ends_when_it_is_asked_to(tmp_path, number):
     """Whatever it was doing when the signal came: eight of them, signalled at eight moments."""
     with ExitStack() as stack:

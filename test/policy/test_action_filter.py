@@ -20,10 +20,11 @@ from vn_nav.policy.action_filter import FACING_LOGITS as BACK
 from vn_nav.policy.action_filter import RESTLESS_RAD as RESTLESS
 from vn_nav.policy.action_filter import SEEN_RAD as SEEN
 from vn_nav.policy.action_filter import BlockedActionFilter, FilterCounts
+from vn_nav.policy.batched import BatchedPolicy, choose, choose_filtered
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import NetworkConfig
-from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime, choose, choose_filtered
+from vn_nav.policy.runtime import PolicyRuntime
 
 TURN = math.radians(30)
 MOVES = ((0.5, 0, 0), (-0.2, 0, 0), (0, 0, TURN), (0, 0, -TURN))

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from vn_nav.errors import UserError
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import HEADS, NetworkConfig
-from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime
+from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS
 

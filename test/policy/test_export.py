@@ -181,7 +181,8 @@ def test_a_policy_that_looks_at_no_goal_has_no_model_of_it(tmp_path):
     assert set(exported(network_of('fused'), tmp_path)) == {'policy', 'goal'}
     sessions = exported(network_of('unreal'), tmp_path, stop_threshold=None)
     assert set(sessions) == {'policy'}
-    assert {path.name for path in tmp_path.iterdir()} == {'policy.onnx', 'README.md'}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        'policy.onnx', 'config.json', 'README.md'}
     assert sessions['policy'].get_modelmeta().custom_metadata_map['stop_threshold'] == ''
 
 

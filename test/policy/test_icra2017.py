@@ -13,10 +13,10 @@ from vn_nav.learning.learner_config import LearnerConfig
 from vn_nav.learning.presets import ENVIRONMENT, PRESETS, preset
 from vn_nav.learning.rollout import Collector
 from vn_nav.observation import Observation
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network_config import NetworkConfig
-from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import DRIVE_ACTIONS

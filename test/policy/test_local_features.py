@@ -19,13 +19,8 @@ from vn_nav.policy.search.local_features import (
     extract,
 )
 from vn_nav.policy.search.searcher import Sight
-from vn_nav.policy.search.verification import (
-    FeaturePairs,
-    View,
-    check_verify,
-    evidence,
-    verified,
-)
+from vn_nav.policy.search.verification import evidence, verified
+from vn_nav.policy.search.views import FeaturePairs, View, check_verify
 
 FOV = math.radians(70)
 SIZE = 256

@@ -8,6 +8,7 @@ import pytest
 from vn_nav.policy.motion import ActionExecutor, cruise, ramp
 from vn_nav.resources import share_file
 from vn_nav.robot import THESIS_ACTIONS, RobotSpec, load_robot
+from vn_sim_bridge.robot.simulated_base import SimulatedBase
 
 DT = 0.05
 SLOW = RobotSpec()
@@ -77,3 +78,74 @@ def test_continuous_mode_ramps_towards_the_cruise_velocity():
         assert np.abs(following - velocity).max() <= SLOW.angular_acceleration * DT + 1e-12
         velocity = following
     assert np.allclose(velocity, target)
+
+
+class LateBase:
+    """Follows commands by a delay and a lag, on a straight line or on the spot."""
+
+    def __init__(self, robot, delay, lag):
+        self.base = SimulatedBase(robot, DT)
+        self.base.respond(delay, lag)
+        self.pose = np.zeros(3)
+
+    def follow(self, velocity):
+        vx, _, wz, _ = self.base.follow(velocity, self.base.velocity)
+        self.pose = self.pose + DT * np.array(
+            [vx * math.cos(self.pose[2]), vx * math.sin(self.pose[2]), wz])
+
+    def drive(self, executor, action):
+        """One action, and until it stands: how far it came, beyond what was asked for."""
+        before, over = self.pose, False
+        executor.begin(action, self.pose)
+        while not over:
+            velocity, over = executor.velocity(DT, self.pose)
+            self.follow(velocity)
+        while self.base.late or self.base.velocity.any():
+            self.follow(np.zeros(4))
+        entry = executor.robot.actions[action]
+        moved = self.pose - before
+        along = moved[2] if entry.axis == 'dyaw' else math.copysign(
+            math.hypot(*moved[:2]), entry.size)
+        return math.copysign(1.0, entry.size) * along - abs(entry.size)
+
+
+@pytest.mark.parametrize('delay, lag', [(0.15, 0.15), (0.1, 0.0), (0.0, 0.1)])
+def test_how_far_a_late_base_rolls_on_is_learned(delay, lag):
+    robot = load_robot(share_file('config/robots/harsh_base.yaml'))
+    names = robot.action_names
+    for turn, forward in (('rotate_left', 'forward'), ('rotate_right', 'backward')):
+        base, stubborn = (LateBase(robot, delay, lag) for _ in range(2))
+        executor = ActionExecutor(robot, tolerance=0.004, creep=0.02, learns=True)
+        plain = ActionExecutor(robot, tolerance=0.004, creep=0.02)
+        over = np.array([[base.drive(executor, names.index(name)) for name in (turn, forward)]
+                         for _ in range(8)])
+        first = [stubborn.drive(plain, names.index(name)) for name in (turn, forward)]
+        assert over[0] == pytest.approx(first), 'nothing is known at first'
+        assert (np.array(first) > [math.radians(3), 0.02]).all()
+        assert np.abs(over[4:, 0]).max() < math.radians(3), np.degrees(over[:, 0])
+        assert np.abs(over[4:, 1]).max() < 0.03, over[:, 1]
+
+
+def test_a_base_that_follows_at_once_learns_nothing():
+    robot = RobotSpec()
+    base = LateBase(robot, 0.0, 0.0)
+    executor = ActionExecutor(robot, tolerance=0.004, creep=0.02, learns=True)
+    for action in (0, 4, 0, 5, 1):
+        assert abs(base.drive(executor, action)) < 0.009
+    assert not any(executor.roll.values())
+
+
+def test_a_pose_that_was_set_is_no_rolling():
+    executor = ActionExecutor(RobotSpec(), tolerance=0.004, creep=0.02, learns=True)
+    LateBase(RobotSpec(), 0.0, 0.0).drive(executor, 0)
+    executor.begin(0, np.array([7.0, 0.0, 0.0]))
+    assert not any(executor.roll.values())
+
+
+def test_a_robot_that_was_pushed_after_a_stop_learns_nothing_of_it():
+    executor = ActionExecutor(RobotSpec(), tolerance=0.004, creep=0.02, learns=True)
+    base = LateBase(RobotSpec(), 0.0, 0.0)
+    base.drive(executor, 0)
+    executor.abandon()
+    executor.begin(0, base.pose + [0.1, 0.0, 0.0])
+    assert not any(executor.roll.values())

@@ -96,6 +96,28 @@ def test_a_decision_moves_and_the_next_waits_for_rest(rig):
     assert ticket is not None and rig.now >= ended + rig.navigator.limits.settle_time
 
 
+def test_a_base_that_rolls_on_is_not_at_rest(rig):
+    """By odometry; and one whose odometry never rests is waited for no longer than 2 s."""
+    rig.arm()
+    for rolls in (0.8, 5.0):
+        rig.decide(1)
+        pose, ticket = np.zeros(3), None
+        while rig.step(pose) is not None and rig.navigator.velocity.any():
+            pose = pose - [0.05, 0.0, 0.0]
+            rig.frame()
+        ended = rig.now
+        while ticket is None:
+            if rig.now - ended < rolls:
+                pose = pose - [0.01, 0.0, 0.0]
+            rig.step(pose)
+            ticket = rig.frame()
+        assert rig.now - ended == pytest.approx(min(rolls, 2.0) + 0.1, abs=0.11)
+        rig.navigator.decided(ticket, 1, rig.now + 0.01)
+        while rig.step(pose) is not None and rig.navigator.velocity.any():
+            pose = pose - [0.05, 0.0, 0.0]
+            rig.frame()
+
+
 def test_camera_silence_holds_then_latches(rig):
     rig.arm()
     rig.decide()

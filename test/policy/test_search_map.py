@@ -13,7 +13,9 @@ from vn_nav.policy.search.grid import CELL, SIDE, OccupancyGrid, on_robot
 from vn_nav.policy.search.hypotheses import Hypotheses, Hypothesis, apart, on_map
 from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, column_bearings
 from vn_nav.policy.search.measured import free_of_points
+from vn_nav.policy.search.rules import Rules
 from vn_nav.policy.search.searcher import Searcher, Sight
+from vn_nav.policy.search.way import decisions_along
 
 BEARINGS = column_bearings(math.pi / 2)
 MOVES = ((0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, math.pi / 6), (0.0, 0.0, -math.pi / 6))
@@ -228,6 +230,67 @@ def test_a_robot_that_gets_nowhere_stops_looking_about_and_passes_obstacles_clos
     cell = narrow.cell(1.0, 0.0)
     assert not Costmap(narrow).passable[cell]
     assert Costmap(narrow, off=searcher_module.TIGHT).passable[cell]
+
+
+def test_decisions_along_a_way_are_its_moves_and_turns():
+    straight = np.array([[0.1 * k, 0.0] for k in range(21)])
+    right = math.pi / 2
+    for yaw, heading, wanted in ((0.0, 0.0, 4), (right, 0.0, 7), (0.0, math.pi, 10)):
+        assert decisions_along(straight, yaw, heading, 0.5, math.pi / 6) == pytest.approx(wanted)
+    corner = np.concatenate([straight, [[2.0, 0.1 * k] for k in range(1, 11)]])
+    assert decisions_along(corner, 0.0, right, 0.5, math.pi / 6) == pytest.approx(9)
+    assert decisions_along(straight[:1], 0.0, right, 0.5, math.pi / 6) == pytest.approx(3)
+
+
+def doubtful(robot, goal, **changes):
+    """A look that gives a goal pose [3] less evidence than the robot follows."""
+    gap = goal[:2] - robot[:2]
+    c, s = math.cos(robot[2]), math.sin(robot[2])
+    turn = goal[2] - robot[2]
+    return sight(position=np.array([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0]]),
+                 heading=np.array([math.cos(turn), math.sin(turn)]), co_visible=0.65, sigma=0.5,
+                 **changes)
+
+
+def hall(budget, decisions=40, **rules):
+    """A search in a hall of 10 m with a guess in a corner: its aims, and metres off the guess."""
+    own = Searcher(MOVES, BEARINGS, RANGE_EDGES, 0.25, Rules(**rules))
+    guess, pose, last = np.array([3.0, -3.0, -math.pi / 2]), np.zeros(3), -1
+    aims, gaps = [], []
+    for k in range(decisions):
+        ranges = one_hot(room(pose, 5.0))
+        seen = sight(ranges=ranges) if k else doubtful(pose, guess, ranges=ranges)
+        last = own.step(seen, last, pose, remaining=None if budget is None else budget - k)
+        dx, dy, turn = MOVES[last]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        pose = pose + [c * dx - s * dy, s * dx + c * dy, turn]
+        aims.append(own.aim)
+        gaps.append(apart(pose, guess)[0])
+    return aims, gaps
+
+
+def test_it_turns_back_to_its_best_guess_while_there_is_budget_for_it():
+    aims, gaps = hall(40)
+    begun = aims.index('follow')
+    assert begun > 5 and set(aims[:begun]) <= {'look', 'explore'}  # not before it has to
+    assert min(gaps) < 1.2 and gaps.index(min(gaps)) < 40  # there, with decisions left
+    there = next(k for k, gap in enumerate(gaps) if gap < 1.2)
+    assert set(aims[begun:there]) <= {'follow', 'approach'}  # it does not waver
+    early, _ = hall(20)
+    assert early.index('follow') < begun
+    # Who does not know, has time, or may not, explores.
+    for other in (hall(None), hall(10_000), hall(40, returns=False)):
+        assert other == hall(None) and 'follow' not in other[0]
+
+
+def test_a_guess_that_was_tried_in_vain_is_nothing_to_return_to():
+    own = Hypotheses()
+    own.look(np.zeros(3), np.array([2.0, 0.0]), 0.3, np.array([1.0, 0.0]), 0.65)
+    own.look(np.zeros(3), np.array([-2.0, 0.0]), 0.3, np.array([1.0, 0.0]), 0.70)
+    weak, best = own.all
+    assert own.best() is own.best(untried=True) is best
+    best.refuted = 1
+    assert own.best() is best and own.best(untried=True) is weak
 
 
 def test_a_way_that_becomes_no_shorter_is_given_up():

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.checkpoint import load_checkpoint
-from vn_nav.policy.runtime import BatchedPolicy, PolicyRuntime
+from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.resources import share_file
 from vn_nav.scenes import house_scenes
 from vn_sim_bridge.navigation.env import NavigationEnv

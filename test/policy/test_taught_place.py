@@ -23,6 +23,7 @@ from vn_nav.policy.search.look import RANGE_EDGES, column_bearings
 from vn_nav.policy.search.recall import GOAL_WEIGHT, Localiser, Recall
 from vn_nav.policy.search.searcher import Searcher
 from vn_nav.policy.search.taught import TaughtPlace
+from vn_nav.policy.search.torch_eyes import TorchEyes
 from vn_nav.policy.zhu_policy import build_policy
 from vn_nav.robot import RobotSpec
 
@@ -313,8 +314,8 @@ def test_a_runtime_recalls_and_prepares_its_goal(tmp_path):
     first = [policy.act(image, np.zeros(3)) for _ in range(3)]
     recall, = policy.search.recalls
     prepared = [own.pose for own in recall.goals]
-    alone = KeyPictures(policy._network, policy._network.taught).poses_of_goal(
-        policy._network.encode_goals(torch.from_numpy(goal)[None]))
+    eyes = policy.search.eyes
+    alone = KeyPictures(eyes, eyes.taught).poses_of_goal(eyes.encode_goals(goal[None]))
     assert [list(pose) for pose in prepared] == [list(own.pose) for own in alone[:3]]
     policy.set_goal(other)
     policy.set_goal(goal)
@@ -322,8 +323,8 @@ def test_a_runtime_recalls_and_prepares_its_goal(tmp_path):
 
 
 def test_robots_in_one_place_do_not_disturb_each_other():
-    policy, shown = taught(), torch.from_numpy(pictures(3, 9))
-    maps = policy.encode_goals(shown)
+    policy = TorchEyes(taught())
+    maps = policy.encode_goals(pictures(3, 9))
 
     def drive(rows):
         driver = SearchDriver(policy, len(rows))
@@ -339,8 +340,8 @@ def test_robots_in_one_place_do_not_disturb_each_other():
 
 
 def test_through_another_lens_it_searches_as_if_it_had_been_taught_nothing():
-    policy = taught()
-    maps = policy.encode_goals(torch.from_numpy(pictures(1, 9)))
+    policy = TorchEyes(taught())
+    maps = policy.encode_goals(pictures(1, 9))
     for zoom, told in ((1.0, True), (1.7, False)):
         driver = SearchDriver(policy, 1)
         driver.act(pictures(1, 20), maps, np.array([-1]), np.array([True]), np.zeros((1, 3)),
@@ -349,11 +350,9 @@ def test_through_another_lens_it_searches_as_if_it_had_been_taught_nothing():
 
 
 def test_votes_through_a_narrow_lens_are_in_metres():
-    policy = taught()
-    shown = torch.from_numpy(pictures(1, 9))
-    goal = policy.encode_goals(shown)
-    with torch.no_grad():
-        look = policy.look(torch.from_numpy(place(1).pictures), goal)
+    policy = TorchEyes(taught())
+    goal = policy.encode_goals(pictures(1, 9))
+    look = policy.look(place(1).pictures, goal)
     one = KeyPictures(policy, place(1)).poses_of_goal(goal)[0].pose
     narrow = dataclasses.replace(place(1), zoom=np.full(1, 2, np.float32))
     other = KeyPictures(policy, narrow).poses_of_goal(goal)[0].pose

@@ -1,5 +1,6 @@
 """The base under the simulated robot: limits are kept, profiles within them are not touched."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ from vn_nav.policy.motion import ActionExecutor
 from vn_nav.resources import share_file
 from vn_nav.robot import AXES, RobotSpec, load_robot
 from vn_sim_bridge.floor.floor_map import clearance
+from vn_sim_bridge.render.randomisation import Randomisation
 from vn_sim_bridge.robot.simulated_base import SimulatedBase
 from vn_sim_bridge.robot.simulated_robot import TICK, SimulatedRobot
 
@@ -105,7 +107,7 @@ def test_at_an_obstacle_the_body_needs_no_braking():
     assert base.follow(np.array([0.3, 0, 0, 0]), np.zeros(4))[0] == 0.3  # the wheels slip
     assert not base.follow(np.zeros(4), np.zeros(4)).any()
     free = SimulatedBase(STANDARD, TICK)
-    free.velocity[0] = 0.3
+    free.velocity = np.array([0.3, 0, 0, 0])
     assert free.follow(np.zeros(4), np.array([0.3, 0, 0, 0]))[0] == pytest.approx(0.275)
 
 
@@ -129,3 +131,59 @@ def test_free_driving_has_no_episode():
         if judged:
             assert judged.end == 0
     assert not robot.velocity.any()
+
+
+def test_a_command_is_heard_late():
+    base = SimulatedBase(STANDARD, TICK)
+    base.respond(delay=0.1)
+    sent = [np.array([0.02, 0, 0, 0]), np.array([0.01, 0, 0, 0]), *[np.zeros(4)] * 3]
+    driven, late = [], []
+    for command in sent:
+        driven.append(base.follow(command, base.velocity)[0])
+        late.append(base.late)
+    assert driven == [0, 0, 0.02, 0.01, 0]
+    assert late == [True, True, True, False, False], 'until the last one that moves is heard'
+
+
+def test_motors_lag_by_their_time_constant_and_come_to_rest():
+    base = SimulatedBase(dataclasses.replace(STANDARD, linear_acceleration=100.0), 0.01)
+    base.respond(lag=0.1)
+    wanted = np.array([0.3, 0, 0, 0])
+    reached = [base.follow(wanted, base.velocity)[0] for _ in range(100)]
+    assert reached[9] == pytest.approx(0.3 * (1 - math.exp(-1)), rel=1e-6)
+    assert reached[-1] == pytest.approx(0.3, rel=1e-3)
+    ticks = 0
+    while base.follow(np.zeros(4), base.velocity).any():
+        ticks += 1
+        assert base.late
+    assert ticks == pytest.approx(10 * math.log(0.3 / 0.02), abs=1) and not base.late
+
+
+def test_a_decision_of_a_late_base_ends_where_it_stands():
+    robot = simulated(randomisation=Randomisation(
+        command_delay=(0.1, 0.1), motor_lag=(0.1, 0.1), camera_delay=(0.15, 0.15)))
+    assert robot.camera_delay == 0.15
+    for _ in range(6):
+        assert robot.drive(np.array([0.3, 0, 0, 0])) is None
+    ends = [robot.drive(np.zeros(4)) for _ in range(40)]
+    (judged,) = np.flatnonzero([end is not None for end in ends])
+    assert judged > 5 and not robot.moves
+    robot.drive(np.array([0.3, 0, 0, 0]))
+    robot.begin_episode(1)
+    assert not robot.moves, 'nothing is on the way where a robot is put elsewhere'
+
+
+def test_a_picture_of_another_format_is_a_part_of_the_square():
+    wide = RobotSpec(camera_fov=math.radians(60))
+    whole = dataclasses.replace(wide, camera_fov=2 * math.atan(4 / 3 * math.tan(math.radians(30))))
+    for aspect, shape in ((4 / 3, (48, 64)), (0.75, (64, 48))):
+        robot = SimulatedRobot('house:7?rooms=2', robot=wide, size=48, aspect=aspect, seed=3)
+        square = SimulatedRobot('house:7?rooms=2', robot=whole, size=64, seed=3)
+        for one in (robot, square):
+            one.begin_episode(0)
+        assert robot.picture_size == shape[::-1]
+        cut = (slice(8, 56), slice(None)) if aspect > 1 else (slice(None), slice(8, 56))
+        for mine, theirs in ((robot.observe(), square.observe()),
+                             (robot.goal_frames(), square.goal_frames())):
+            assert mine.rgb.shape[-2:] == mine.depth.shape[-2:] == shape
+            np.testing.assert_array_equal(mine.rgb, theirs.rgb[(..., *cut)])

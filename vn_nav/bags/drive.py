@@ -37,7 +37,7 @@ def find_topics(bag: str | Path, wanted: Topics) -> Topics:
 
 
 def timestamped_messages(bag: str | Path, topics: Topics) -> Iterator[TimestampedMessage]:
-    """The messages of a drive in the order of recording, one take after the other.
+    """The messages of a drive in the order of recording, one take after the other; no scans.
 
     Args:
         bag: a rosbag2 folder or an MCAP file.
@@ -46,7 +46,7 @@ def timestamped_messages(bag: str | Path, topics: Topics) -> Iterator[Timestampe
     Raises:
         BagError: damage, or a message that is not what its topic says.
     """
-    names = tuple(filter(None, dataclasses.astuple(topics)))
+    names = tuple(filter(None, dataclasses.astuple(dataclasses.replace(topics, scan=''))))
     for m in messages(bag, names, clocks=(topics.image, topics.odometry or topics.command)):
         yield TimestampedMessage(m.topic, m.message, m.time)
 

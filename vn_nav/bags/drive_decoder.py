@@ -16,22 +16,24 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_nav.bags.dataset import MAX_DEPTH, Wanted
 from vn_nav.bags.drive import Frame, Report, find_topics, synchronise, timestamped_messages
+from vn_nav.bags.roles import Topics
 from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter, Step
 from vn_nav.bags.storage.stream import messages, summary
+from vn_nav.calibration import is_rectified, read_calibration
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
+from vn_nav.rectification import Camera
 
-FORMAT = 3  # of the files; another one is decoded anew
+FORMAT = 4  # of the files; another one is decoded anew
 INDEX = 'index.json'
 # Pictures in the decoders at once: bounds the memory.
 MAX_PICTURES_IN_FLIGHT = 64
 
 
-def decoded(steps: Iterable[Step], wanted: Wanted, fov: float | None
+def decoded(steps: Iterable[Step], wanted: Wanted, camera: Camera | None
             ) -> Iterator[tuple[Step, dict[str, np.ndarray] | None]]:
     """Steps with their pictures, in order; None where a picture cannot be decoded.
 
@@ -42,7 +44,7 @@ def decoded(steps: Iterable[Step], wanted: Wanted, fov: float | None
     flying: collections.deque = collections.deque()
     try:
         for step in steps:
-            flying.append((step, pool.submit(_pictures, step.frame, wanted, fov)))
+            flying.append((step, pool.submit(_pictures, step.frame, wanted, camera)))
             if len(flying) >= MAX_PICTURES_IN_FLIGHT:
                 step, future = flying.popleft()
                 yield step, future.result()
@@ -53,20 +55,20 @@ def decoded(steps: Iterable[Step], wanted: Wanted, fov: float | None
         pool.shutdown(cancel_futures=True)
 
 
-def read_steps(bag: str | Path, wanted: Wanted, report: Report) -> tuple[Iterator[Step], dict]:
+def read_steps(bag: str | Path, wanted: Wanted, report: Report
+               ) -> tuple[Iterator[Step], dict, Camera | None]:
     """The steps of a bag as they stream by, pictures not yet decoded, and facts of its camera.
 
     Returns:
-        The steps; and `topics` (as they are in the bag) and `fov` (rad, of the shorter side;
-        None: the bag has no camera_info).
+        The steps; `topics` (as they are in the bag) and `fov` (rad, of the shorter side; None:
+        the bag has no camera_info, or one that is not calibrated); and the camera.
     """
     topics = find_topics(bag, wanted.topics)
-    fov = _field_of_view(bag, topics.camera_info)
-    if fov is not None:
-        crop_fraction(fov, wanted.robot.camera_fov)  # or says that the camera is too narrow
+    camera = _camera(bag, topics, wanted.robot.camera_fov)
     frames = synchronise(timestamped_messages(bag, topics), topics, report)
     steps = (_each(frames) if wanted.every else ActionSegmenter(wanted.robot, report).cut(frames))
-    return steps, {'topics': dataclasses.asdict(topics), 'fov': fov}
+    return steps, {'topics': dataclasses.asdict(topics),
+                   'fov': None if camera is None else camera.fov}, camera
 
 
 def _each(frames) -> Iterator[Step]:
@@ -74,35 +76,45 @@ def _each(frames) -> Iterator[Step]:
         yield Step(frame, NO_ACTION, False)
 
 
-def _pictures(frame, wanted: Wanted, fov: float | None) -> dict[str, np.ndarray] | None:
+def _pictures(frame, wanted: Wanted, camera: Camera | None) -> dict[str, np.ndarray] | None:
     """What the arrays of a step hold of pictures; depth and labels only if they can be read."""
-    lens = {} if fov is None else {'fov': fov, 'target_fov': wanted.robot.camera_fov}
+    target = wanted.robot.camera_fov
+    lens = {} if camera is None else {'fov': camera.fov, 'target_fov': target}
     try:
-        smallest = needed_side(wanted.size, **lens)
-        shown = {'image': preprocess(decode_rgb(frame.image, smallest), wanted.size, **lens)}
+        smallest = (needed_side(wanted.size) if camera is None
+                    else camera.needed_side(wanted.size, target))
+        picture = decode_rgb(frame.image, smallest)
+        if camera is not None:
+            picture = camera.rectify(picture)
+        shown = {'image': preprocess(picture, wanted.size, **lens)}
     except ImageError:
         return None
     with contextlib.suppress(ImageError):
         if frame.depth is not None:
-            depth = preprocess_map(decode_depth(frame.depth), wanted.size, **lens)
+            depth = preprocess_map(_map(decode_depth(frame.depth), camera), wanted.size, **lens)
             shown['depth'] = np.where(np.isfinite(depth), np.clip(
                 np.nan_to_num(depth) * (255 / MAX_DEPTH), 1, 255), 0).astype(np.uint8)
     with contextlib.suppress(ImageError):
         if frame.labels is not None:
-            shown['labels'] = preprocess_map(decode_labels(frame.labels), wanted.size, **lens)
+            shown['labels'] = preprocess_map(
+                _map(decode_labels(frame.labels), camera), wanted.size, **lens)
     return shown
 
 
-def _field_of_view(bag: str | Path, topic: str) -> float | None:
-    """Of the shorter side [rad], by the first camera_info; None where there is none."""
-    if not topic:
+def _map(values: np.ndarray, camera: Camera | None) -> np.ndarray:
+    """Depth or labels, which the picture's camera has taken."""
+    if camera is None or not camera.fits(values):
+        return values
+    return camera.rectify(values, nearest=True)
+
+
+def _camera(bag: str | Path, topics: Topics, target_fov: float) -> Camera | None:
+    """By the first camera_info; None where there is none, or it is not calibrated."""
+    if not topics.camera_info:
         return None
-    for message in messages(bag, (topic,)):
-        info = message.message
-        focal = float(info.k[0])
-        if focal > 0 and info.width > 0 and info.height > 0:
-            return field_of_view(info.width, info.height, focal)
-        break
+    for message in messages(bag, (topics.camera_info,)):
+        calibration = read_calibration(message.message, rectified=is_rectified(topics.image))
+        return None if calibration is None else Camera(calibration, target_fov)
     return None
 
 
@@ -158,7 +170,9 @@ class _Columns:
 def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], None]) -> None:
     """Decode the steps of a bag into arrays and an index in a folder."""
     report, columns = Report(), _Columns(folder)
-    steps, facts = read_steps(bag, wanted, report)
+    steps, facts, camera = read_steps(bag, wanted, report)
+    if camera is not None:
+        crop_fraction(camera.fov, wanted.robot.camera_fov)  # or says that it is too narrow
     optional = {name: _Optional(name) for name in ('depth', 'labels') if facts['topics'][name]}
     if 'labels' in optional:
         optional['labels'].dtype = _label_type(bag, facts['topics']['labels'])
@@ -166,7 +180,7 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
     shown_goal, number, bad, unseen = None, -1, 0, 0
     rows: list[list[float]] = []
     held = summary(bag)[facts['topics']['image']].count or math.inf
-    for step, pictures in decoded(steps, wanted, facts['fov']):
+    for step, pictures in decoded(steps, wanted, camera):
         show(report.pictures / held)
         frame = step.frame
         if pictures is None:
@@ -176,7 +190,7 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
             continue
         if frame.goal is not shown_goal:
             shown_goal = frame.goal
-            number = _keep_goal(shown_goal, wanted, facts['fov'], columns, goals)
+            number = _keep_goal(shown_goal, wanted, camera, columns, goals)
             unseen += number < 0 and shown_goal is not None
         rows.append([frame.stamp, step.action, frame.episode, number, *frame.pose])
         columns.append('image', pictures['image'])
@@ -251,16 +265,18 @@ class _Optional:
         return f'{self._role} left out: {"; ".join(faults)}' if faults else ''
 
 
-def _keep_goal(message: Any, wanted: Wanted, fov: float | None, columns: _Columns,
+def _keep_goal(message: Any, wanted: Wanted, camera: Camera | None, columns: _Columns,
                goals: dict[bytes, int]) -> int:
     """Number of a goal picture, which is kept once; -1: it is none, or cannot be decoded."""
-    lens = {} if fov is None else {'fov': fov, 'target_fov': wanted.robot.camera_fov}
+    lens = {} if camera is None else {'fov': camera.fov, 'target_fov': wanted.robot.camera_fov}
     try:
         picture = None if message is None else decode_rgb(message)
     except ImageError:
         picture = None
     if picture is None:
         return -1
+    if camera is not None and camera.fits(picture):
+        picture = camera.rectify(picture)
     picture = preprocess(picture, wanted.size, **lens)
     digest = hashlib.sha256(picture.tobytes()).digest()
     if digest not in goals:

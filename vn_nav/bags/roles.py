@@ -15,12 +15,13 @@ import yaml
 from vn_nav.errors import UserError
 
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-ODOMETRY = 'nav_msgs/msg/Odometry'
+ODOMETRY, CAMERA_INFO = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/CameraInfo'
 TYPES = {  # of each role of `Topics`
     'image': (IMAGE, COMPRESSED), 'odometry': (ODOMETRY,),
     'command': ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'),
     'goal': (IMAGE, COMPRESSED), 'depth': (IMAGE,), 'labels': (IMAGE,),
-    'episode_end': ('std_msgs/msg/UInt8',), 'camera_info': ('sensor_msgs/msg/CameraInfo',)}
+    'episode_end': ('std_msgs/msg/UInt8',), 'camera_info': (CAMERA_INFO,),
+    'scan': ('sensor_msgs/msg/LaserScan',)}
 MAX_PROPOSED_TOPICS = 4  # topics that are proposed, at most
 
 
@@ -39,6 +40,7 @@ class Topics:
     labels: str = 'labels/image_raw'
     episode_end: str = 'episode_end'
     camera_info: str = 'camera_info'
+    scan: str = ''  # for a policy's map, where it is asked for; training reads none
 
     def within(self, recorded: Mapping[str, str]) -> Topics:
         """The same with the names as they are in a bag: slashes as there, pictures compressed.

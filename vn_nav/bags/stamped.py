@@ -62,9 +62,13 @@ class Stamped:
 
     Stamps go on in a run. Where they go back as `set_back` says, or leave a gap, another run
     begins; the one before is kept for the pictures that were taken in it and are still to come.
+
+    Args:
+        window: s between the stamps of a picture and of what belongs to it.
     """
 
-    def __init__(self):
+    def __init__(self, window: float = STAMP_WINDOW_S):
+        self._window = window
         self._runs: list[_Run] = []  # the one that went on last is the last
 
     def add(self, stamp: float, time: float, value: Any) -> None:
@@ -86,10 +90,10 @@ class Stamped:
 
     def reaches(self, stamp: float) -> bool:
         """Whether nothing nearer to a stamp can come any more."""
-        return any(run.stamps[0] - STAMP_WINDOW_S <= stamp <= run.stamps[-1] for run in self._runs)
+        return any(run.stamps[0] - self._window <= stamp <= run.stamps[-1] for run in self._runs)
 
     def around(self, stamp: float, time: float) -> tuple[Entry, Entry] | None:
-        """The messages before and after a stamp; None: the nearer is not within `STAMP_WINDOW_S`.
+        """The messages before and after a stamp; None: the nearer is not within the window.
 
         Args:
             stamp: of a picture [s].
@@ -99,7 +103,7 @@ class Stamped:
         return None if found is None else found[1]
 
     def nearest(self, stamp: float, time: float) -> Any:
-        """The message nearest to a stamp, within `STAMP_WINDOW_S`, or None; drops older ones."""
+        """The message nearest to a stamp, within the window, or None; drops older ones."""
         found = self._near(stamp, time)
         if found is None:
             return None
@@ -111,5 +115,5 @@ class Stamped:
     def _near(self, stamp: float, time: float) -> tuple[_Run, tuple[Entry, Entry]] | None:
         pairs = [(run, run.around(stamp)) for run in self._runs]
         near = [(run, pair) for run, pair in pairs
-                if min(abs(entry.stamp - stamp) for entry in pair) <= STAMP_WINDOW_S]
+                if min(abs(entry.stamp - stamp) for entry in pair) <= self._window]
         return min(near, key=lambda found: abs(found[1][0].time - time), default=None)

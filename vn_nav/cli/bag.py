@@ -61,6 +61,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                        'default: the last picture of each episode')
     drive.add_argument('--decoding', choices=('sample', 'greedy'),
                        help='default: as the checkpoint was measured')
+    ranges = drive.add_mutually_exclusive_group()
+    ranges.add_argument('--scan-topic', metavar='TOPIC', default='', help='LaserScan of the bag '
+                        'that the map of a policy which searches takes, as policy_node does')
+    ranges.add_argument('--depth-topic', metavar='TOPIC', default='', help='the same of depth '
+                        'pictures, with camera_info beside them')
+    for name, what in (('x', 'ahead of the centre of the robot [m]'), ('y', 'to the left [m]'),
+                       ('yaw', 'heading [rad]')):
+        drive.add_argument(f'--scan-{name}', type=float, default=0.0, metavar=name.upper(),
+                           help=f'where that sensor sits: {what}; default: 0')
     drive.set_defaults(run=run_drive)
 
 
@@ -74,6 +83,18 @@ def _add_drive(parser: argparse.ArgumentParser) -> None:
 
 def run_doctor(args) -> int:
     """`vn_nav bag doctor`: 0 where the bag can be used, 1 where it cannot."""
+    return 0 if examine(args).usable else 1
+
+
+def examine(args):
+    """Print what is wrong with a bag, and write it as JSON where that is wanted.
+
+    Args:
+        args: bag, checkpoint, robot, topics and json, as options of `vn_nav bag doctor`.
+
+    Returns:
+        The `Diagnosis`.
+    """
     from vn_nav.bags.doctor.checks import diagnose
     from vn_nav.bags.roles import load_topics
     if args.json is not None and not args.json.absolute().parent.is_dir():
@@ -90,7 +111,7 @@ def run_doctor(args) -> int:
         except OSError as error:
             raise UserError('the figures can be written', f'{args.json}: {error.strerror}',
                             'free some space, or choose another place') from error
-    return 0 if diagnosis.usable else 1
+    return diagnosis
 
 
 def run_recover(args) -> int:
@@ -141,9 +162,12 @@ def run_export(args) -> int:
 def run_drive(args) -> int:
     """`vn_nav bag drive`: 0; 130 after SIGINT or SIGTERM, with what was recorded until then."""
     from vn_nav.cli.bag_drive import run
+    from vn_nav.measured_ranges import RangeSource
     out = args.out or Path(f'{args.bag.resolve().stem}_shadow')
     return run(args.bag, args.checkpoint, out, other=args.compare, robot=args.robot,
-               topics=_topics(args.topics), goal=args.goal, decoding=args.decoding)
+               topics=_topics(args.topics), goal=args.goal, decoding=args.decoding,
+               source=RangeSource(args.scan_topic, args.depth_topic,
+                                  (args.scan_x, args.scan_y, args.scan_yaw)))
 
 
 def _topics(path: Path | None):

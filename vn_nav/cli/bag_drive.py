@@ -23,13 +23,16 @@ from vn_nav.bags.shadow.plan import Plan, make_plan
 from vn_nav.errors import UserError
 from vn_nav.files import write_file
 from vn_nav.goal_picture import read_goal_picture
+from vn_nav.measured_ranges import RangeSource
 from vn_nav.nodes.isolation import stay_on_this_host
+from vn_nav.observation import check_camera
 from vn_nav.policy.checkpoint import LoadedCheckpoint, load_checkpoint
+from vn_nav.policy.checkpoint_info import SEARCH
 from vn_nav.robot import RobotSpec, load_robot
 
 
 def run(bag: Path, checkpoint: Path, out: Path, *, other: Path | None, robot: Path | None,
-        topics: Topics, goal: Path | None, decoding: str | None) -> int:
+        topics: Topics, goal: Path | None, decoding: str | None, source: RangeSource) -> int:
     """Drive along a bag with one policy, or with two and compare them.
 
     Args:
@@ -41,12 +44,14 @@ def run(bag: Path, checkpoint: Path, out: Path, *, other: Path | None, robot: Pa
         topics: names in the bag.
         goal: picture file where the bag shows none.
         decoding: None: as the checkpoints were measured.
+        source: of ranges for the policies' maps, by names in the bag.
 
     Returns:
         The exit code.
 
     Raises:
-        UserError: see `make_plan` and `vn_nav.nodes.shadow.drive`; actions that differ.
+        UserError: see `make_plan` and `vn_nav.nodes.shadow.drive`; actions that differ, a camera
+            that does not suit a policy, ranges for one that has no map.
     """
     folders = [checkpoint] if other is None else [checkpoint, other]
     policies = [load_checkpoint(folder) for folder in folders]
@@ -55,12 +60,21 @@ def run(bag: Path, checkpoint: Path, out: Path, *, other: Path | None, robot: Pa
     if out.exists():
         raise UserError('what is recorded has a folder of its own', str(out),
                         'choose another --out, or remove it')
-    plan = make_plan(bag, spec, topics, picture)
+    searches = [policy.config.architecture == SEARCH for policy in policies]
+    source.check_policy(searches=all(searches))
+    names = {role: name for role, name in (('scan', source.scan), ('depth', source.depth)) if name}
+    plan = make_plan(bag, spec, dataclasses.replace(topics, **names), picture,
+                     ranges=next(iter(names), ''))
+    if plan.camera is not None:
+        for policy, any_lens in zip(policies, searches, strict=True):
+            check_camera(*plan.camera, math.radians(policy.info['camera_fov_deg']),
+                         any_lens=any_lens)
     print(f'{bag}: {_words(plan)}', flush=True)
     outs = [out] if other is None else [out / 'a', out / 'b']
     latencies = []
-    for folder, policy in zip(outs, folders, strict=True):
-        driven = _shadow().drive(plan, policy, folder, robot=robot, decoding=decoding,
+    for folder, driver, has_map in zip(outs, folders, searches, strict=True):
+        driven = _shadow().drive(plan, driver, folder, robot=robot, decoding=decoding,
+                                 searches=has_map, mount=source.mount,
                                  say=lambda line: print(line, flush=True))
         left_out = (f'; {plan.unreadable} pictures could not be decoded' if plan.unreadable
                     else '')
@@ -86,7 +100,7 @@ def _shadow():
 
 
 def _robot(robot: RobotSpec, policies: list[LoadedCheckpoint]) -> RobotSpec:
-    """The robot with the policies' actions, and the camera that the first of them needs."""
+    """The robot with the policies' actions."""
     first, *others = policies
     for policy in others:
         if sorted(policy.config.actions) != sorted(first.config.actions):
@@ -94,9 +108,7 @@ def _robot(robot: RobotSpec, policies: list[LoadedCheckpoint]) -> RobotSpec:
                             f'{", ".join(first.config.actions)}',
                             ', '.join(policy.config.actions), 'compare others')
         robot.with_actions(policy.config.actions, policy.config.moves)
-    robot = robot.with_actions(first.config.actions, first.config.moves)
-    widest = max(policy.info['camera_fov_deg'] for policy in policies)
-    return dataclasses.replace(robot, camera_fov=math.radians(widest))
+    return robot.with_actions(first.config.actions, first.config.moves)
 
 
 def _words(plan: Plan) -> str:
@@ -122,6 +134,8 @@ def _told(folder: Path, driven) -> str:
             f'{arrived} times, {len(shadow.commands)} commands; '
             + ('' if shadow.filtered is None
                else f'action filter: {filter_words(shadow.filtered)}; ')
+            + ('' if shadow.ranges is None
+               else f'measured ranges at {shadow.ranges} of them; ')
             + 'latency '
             f'{np.median(driven.latencies) * 1e3:.0f} ms (p95 '
             f'{np.quantile(driven.latencies, 0.95) * 1e3:.0f})')

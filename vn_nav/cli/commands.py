@@ -20,12 +20,16 @@ COMMANDS = {
     'train': 'train a policy',
     'collect': 'record pictures from random poses as a bag, for pre-training',
     'pretrain': 'pre-train a policy on recorded bags',
+    'drive-trial': 'drive on a base that slips and is late, beside an ideal one, over ROS 2',
     'teach': 'learn the place where a bag was driven, in its pictures',
     'evaluate': 'measure a checkpoint',
+    'robustness': 'measure what a checkpoint bears: noise, light, other cameras, latency, ...',
     'film': 'film an episode of a policy that searches, with its map',
     'compare': "plot several runs' learning curves",
+    'reproduce': 'run an experiment of the thesis again',
     'publish': 'measure a run and write it as a checkpoint to ship',
     'export': 'write a checkpoint as ONNX',
+    'doctor': 'check a live ROS 2 graph before a robot drives, and say what to type',
     'bag': 'check and repair recorded drives',
     'simulators': 'list the simulators, and what each can do',
     'house': 'look at an embedded house',
@@ -47,7 +51,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     for name, about in COMMANDS.items():
         own = commands.add_parser(name, help=about)
         if command in (None, name):
-            module = importlib.import_module(f'vn_nav.cli.{name}')
+            module = importlib.import_module(f'vn_nav.cli.{name.replace("-", "_")}')
             if hasattr(module, 'run'):
                 own.set_defaults(run=module.run)
             module.add_options(own)

@@ -210,7 +210,7 @@ def bridge_parameters(checkpoint: LoadedCheckpoint, scene: str, count: int, limi
     varies = simulator_class(parse_scene(scene).simulator).capabilities.appearance
     return {'scene': scene, 'size': checkpoint.config.size,
             'randomisation': info['randomisation'] if varies else 'none',
-            'seed': SEED, 'stop': _stop(info),
+            'seed': SEED, 'stop': stop_of(info),
             'robot': str(share_file(BASE)), 'episodes': count, 'max_decisions': limit}
 
 
@@ -273,7 +273,7 @@ def _policy(stage: Stage) -> str:
     return f'policy_{stage.place}'
 
 
-def _stop(info: dict) -> str:
+def stop_of(info: dict) -> str:
     """What ends an episode before its limit, by what a checkpoint says of itself."""
     return ARRIVAL if info['stop_threshold'] is None else DECLARED
 
@@ -298,7 +298,7 @@ def _results(drives: list[Drive], stages: list[Stage]) -> dict:
     result = {}
     for stage, drive in zip(stages, drives, strict=True):
         info, count = stage.checkpoint.info, stage.count
-        stop = _stop(info)
+        stop = stop_of(info)
         figures = summarise([recorded.episode for recorded in drive.episodes])
         env = control_env(make_env, stage.checkpoint, stage.scene, count, stage.limit)
         control = run_episodes(env, random_actor(env, SEED), count, seed=SEED, robot=RobotSpec())

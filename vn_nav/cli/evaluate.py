@@ -14,7 +14,7 @@ from vn_nav.cli.options import (
     given_place_options,
     place_options,
 )
-from vn_nav.cli.scenes import scenes_from, split_scenes
+from vn_nav.cli.scenes import SPLIT_SCENES, UNSEEN_GOALS, checkpoint_scenes, scenes_from
 from vn_nav.cli.world import (
     add_world,
     check_backend,
@@ -29,16 +29,14 @@ from vn_nav.files import write_file
 from vn_nav.learning.teach_evaluation import DRIVE_SPLITS
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.search.local_features import SIDE
-from vn_nav.policy.search.verification import NONE, VERIFY, check_verify
+from vn_nav.policy.search.views import NONE, VERIFY, check_verify
 from vn_nav.report import tables
 from vn_nav.report.evaluation_page import evaluation_page
 from vn_nav.robot import load_robot
-from vn_nav.scenes import BAG, HOUSE, house_scene, one_simulator, parse_scene, rooms_of
+from vn_nav.scenes import BAG, HOUSE, one_simulator, rooms_of
 
 # Options without meaning in a bag.
 OF_SCENES = ('scene', 'house', 'houses', 'rooms', 'randomisation')
-SPLIT_SCENES = 20  # of a split that the checkpoint does not know, by default
-UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -172,27 +170,10 @@ def _splits(args: argparse.Namespace, info: dict) -> dict[str, list[str]]:
     if args.rooms and not (houses or args.house):
         raise UserError('rooms are a number of houses', f'--rooms {args.rooms} with a policy of '
                         f'{info["simulator"]}', 'leave it out')
-    rooms = args.rooms or (_rooms(info) if houses else None)
     if args.house or args.scene:
-        return {'scenes': scenes_from(args, rooms)}
-    found = {}
-    for name in args.split or ['seen_goals']:
-        if name in ('seen_goals', 'unseen_goals'):
-            found[name] = info['scenes'][:args.houses]
-            if args.rooms:
-                found[name] = list(dict.fromkeys(
-                    house_scene(int(parse_scene(scene).place), rooms) for scene in found[name]))
-            if not found[name]:
-                raise UserError('seen and unseen goals are in the scenes of the checkpoint',
-                                'a checkpoint that names none', 'give --scene, --house or another '
-                                '--split')
-        else:
-            found[name] = split_scenes(info['simulator'], name, args.houses or SPLIT_SCENES, rooms)
-            known = [scene for scene in found[name] if scene in info['scenes']]
-            if name != 'train' and known:
-                raise UserError(f'the checkpoint was not trained in scenes of split {name}',
-                                known[0], 'choose another split')
-    return found
+        return {'scenes': scenes_from(args, args.rooms or (_rooms(info) if houses else None))}
+    return {name: checkpoint_scenes(info, name, args.houses, args.rooms)
+            for name in args.split or ['seen_goals']}
 
 
 def _rooms(info: dict) -> int | None:

@@ -10,7 +10,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `vn_nav export`."""
     parser.add_argument('checkpoint', type=Path)
     parser.add_argument('--onnx', type=Path, required=True, metavar='FOLDER',
-                        help='for policy.onnx and goal.onnx')
+                        help='for the models and what the robot needs with them')
 
 
 def run(args: argparse.Namespace) -> int:

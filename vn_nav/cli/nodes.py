@@ -13,6 +13,11 @@ def _start(module: str) -> int:
     return importlib.import_module(module).main()
 
 
+def dashboard_node() -> int:
+    """A page in the browser, to watch and to drive by."""
+    return _start('vn_nav.nodes.dashboard_node')
+
+
 def goal_node() -> int:
     """Show the robot a picture from a file."""
     return _start('vn_nav.nodes.goal_node')
@@ -31,3 +36,8 @@ def recorder_node() -> int:
 def sim_bridge_node() -> int:
     """Simulate a robot in a house."""
     return _start('vn_sim_bridge.bridge_node')
+
+
+def teleop_node() -> int:
+    """Drive by keyboard or joystick."""
+    return _start('vn_nav.nodes.teleop_node')

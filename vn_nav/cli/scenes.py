@@ -5,7 +5,19 @@ from __future__ import annotations
 import argparse
 
 from vn_nav.errors import UserError
-from vn_nav.scenes import HOUSE, ROOMS, house_scenes, scene_name
+from vn_nav.scenes import (
+    HOUSE,
+    ROOMS,
+    house_scene,
+    house_scenes,
+    parse_scene,
+    rooms_of,
+    scene_name,
+)
+
+OWN_SPLITS = ('seen_goals', 'unseen_goals')  # in the scenes of a checkpoint's training
+SPLIT_SCENES = 20  # of a split that the checkpoint does not know, by default
+UNSEEN_GOALS = 1  # `EnvConfig.goal_seed` of goals that no training shows (its own is 0)
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +75,7 @@ def split_scenes(simulator: str, split: str, count: int | None, rooms: int | Non
     from vn_sim_bridge.simulators import simulator_class
     splits = simulator_class(simulator).splits
     if split not in splits:
-        raise UserError(f'a split is one of {", ".join([*splits, "seen_goals", "unseen_goals"])}',
+        raise UserError(f'a split is one of {", ".join([*splits, *OWN_SPLITS])}',
                         split, 'choose one of them')
     found = list(splits[split][:count])
     if rooms not in (None, ROOMS):
@@ -71,4 +83,36 @@ def split_scenes(simulator: str, split: str, count: int | None, rooms: int | Non
             raise UserError('rooms are a number of houses', f'--rooms {rooms} with {simulator}',
                             'leave it out')
         found = [scene_name(f'{scene}?rooms={rooms}') for scene in found]
+    return found
+
+
+def checkpoint_scenes(info: dict, split: str, count: int | None = None,
+                      rooms: int | None = None) -> list[str]:
+    """The scenes of a split, to measure a checkpoint in.
+
+    Args:
+        info: of the checkpoint.
+        split: its name, or one of `OWN_SPLITS`.
+        count: at most so many; None: all of its own, `SPLIT_SCENES` others.
+        rooms: of houses; None: as of those that it was trained in.
+
+    Raises:
+        UserError: no such split; or the checkpoint was trained in it, or, where its own scenes
+            are asked for, names none.
+    """
+    if split in OWN_SPLITS:
+        own = list(info['scenes'][:count])
+        if not own:
+            raise UserError('seen and unseen goals are in the scenes of the checkpoint',
+                            'a checkpoint that names none',
+                            'give --scene, --house or another --split')
+        return own if not rooms else list(dict.fromkeys(
+            house_scene(int(parse_scene(scene).place), rooms) for scene in own))
+    if rooms is None and info['simulator'] == HOUSE and info['scenes']:
+        rooms = rooms_of(info['scenes'][0])
+    found = split_scenes(info['simulator'], split, count or SPLIT_SCENES, rooms)
+    known = [scene for scene in found if scene in info['scenes']]
+    if split != 'train' and known:
+        raise UserError(f'the checkpoint was not trained in scenes of split {split}', known[0],
+                        'choose another split')
     return found

@@ -86,8 +86,8 @@ def run(args: argparse.Namespace, config: TrainConfig) -> int:
             'world_version': source.simulator.version,
             'data': f' of {len(scenes)} scenes, and {len(others)} others to judge by',
             'notes': f'Trained on {machine(config.device)}, {config.threads} thread(s), '
-                     f'{datetime.date.today().isoformat()}. The figures are of pairs of pictures '
-                     f'in {len(others)} scenes that it did not learn from; no episode was driven.'}
+                     f'{datetime.date.today().isoformat()}. Held-out pairs are of pictures '
+                     f'in {len(others)} scenes that it did not learn from.'}
 
         def page(rows, judged) -> str:
             from vn_nav.report.sight_page import sight_page

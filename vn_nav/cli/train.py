@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vn_nav.cli.options import command_line, parse_changes
 from vn_nav.cli.scenes import split_scenes, training_scenes
-from vn_nav.cli.world import add_world, check_backend, machine, make_env
+from vn_nav.cli.world import MOTION_NOISE, add_world, check_backend, machine, make_env
 from vn_nav.errors import UserError
 from vn_nav.learning.left_out import ALWAYS, config_without
 from vn_nav.learning.over_ros import config_over_ros
@@ -97,6 +97,8 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--objects', type=int, default=1, help='in the place at a time')
     parser.add_argument('--actions', default=','.join(DRIVE_ACTIONS),
                         help="names from the robot's table, with commas between")
+    parser.add_argument('--motion-noise', choices=tuple(MOTION_NOISE), default='all',
+                        help='of moves and turns, of moves alone (thesis, 5.6), or none')
     parser.add_argument('--size', type=int, default=84, help='side of the pictures [pixels]')
     for name, (kind, about) in (NUMBERS | WORLD).items():
         parser.add_argument('--' + name.replace('_', '-'), type=kind, help=about)
@@ -180,7 +182,7 @@ def run(args: argparse.Namespace) -> int:
                    device=config.device, may_lack=optional,
                    actions=tuple(args.actions.split(',')), task=args.task,
                    objects=args.objects, goals_per_room=args.goals_per_room,
-                   goal_variants=args.goal_variants,
+                   goal_variants=args.goal_variants, **MOTION_NOISE[args.motion_noise],
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
     config, words = config_without(config, env.config.privileged, env.simulator_name,
                                    always=ALWAYS if _has_goals(env, config.device) else ())
@@ -190,7 +192,7 @@ def run(args: argparse.Namespace) -> int:
     info = _info(args, config, env, bags) | {
         'simulator': env.simulator_name, 'scenes': scenes, 'randomisation': args.randomisation,
         'goals_per_room': args.goals_per_room, 'goal_variants': args.goal_variants,
-        'task': args.task, 'objects': args.objects}
+        'task': args.task, 'objects': args.objects, 'motion_noise': args.motion_noise}
     pairs = None
     if config.pair_minutes and not args.init:
         pairs = _pair_sources(args, config, scenes)

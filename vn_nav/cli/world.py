@@ -9,12 +9,20 @@ import os
 import platform
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from vn_nav.cli.scenes import add_scene_options
 from vn_nav.errors import UserError
 from vn_nav.scenes import BAG, ROOMS
 
+if TYPE_CHECKING:
+    from vn_nav.robot import RobotSpec
+    from vn_sim_bridge.render.randomisation import Randomisation
+
 SAY = functools.partial(print, flush=True)
+# Values of --motion-noise, as options of `EnvConfig`.
+MOTION_NOISE: dict[str, dict[str, Any]] = {
+    'all': {}, 'moves': {'turn_noise': False}, 'none': {'noise': 0.0}}
 BACKENDS = ('house',)  # of --house and --houses; other scenes are named by --scene
 
 
@@ -39,8 +47,8 @@ def check_backend(name: str) -> None:
         raise UserError(f'the backend is one of: {", ".join(BACKENDS)}', name, 'choose one')
 
 
-def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
-             randomisation: str | Path = 'none', device: str = 'cpu',
+def make_env(scenes, envs: int, *, robot: Path | RobotSpec | None = None, threads: int = 1,
+             randomisation: str | Path | Randomisation = 'none', device: str = 'cpu',
              may_lack: Collection[str] | None = None,
              say: Callable[[str], None] = SAY, **options):
     """A `NavigationEnv` of some scenes; without a robot file with the scenes' own robot.
@@ -52,7 +60,6 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
             that cannot do them; then `privileged` are wishes as well. None: all must be there.
         say: receives the lines.
     """
-    from vn_nav.robot import load_robot
     from vn_sim_bridge.navigation.env import NavigationEnv
     from vn_sim_bridge.navigation.env_config import (
         EnvConfig,
@@ -61,11 +68,13 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
         with_own_actions,
         without_the_unknown,
     )
-    from vn_sim_bridge.render.randomisation import load_randomisation
+    from vn_sim_bridge.render.randomisation import Randomisation, load_randomisation
     from vn_sim_bridge.simulators import open_simulator, robot_for
-    config = EnvConfig(scenes=tuple(scenes), num_envs=envs,
-                       randomisation=load_randomisation(randomisation), **options)
-    spec = robot_for(config.scenes, load_robot(robot) if robot else None)
+    if not isinstance(randomisation, Randomisation):
+        randomisation = load_randomisation(randomisation)
+    config = EnvConfig(scenes=tuple(scenes), num_envs=envs, randomisation=randomisation,
+                       **options)
+    spec = robot_for(config.scenes, _loaded(robot))
     if device == 'cpu':
         if may_lack is None:
             return NavigationEnv(config, spec, threads=threads)
@@ -87,12 +96,18 @@ def make_env(scenes, envs: int, *, robot: Path | None = None, threads: int = 1,
     return WarpNavigationEnv(config, spec, device=device)
 
 
+def _loaded(robot: Path | RobotSpec | None) -> RobotSpec | None:
+    from vn_nav.robot import RobotSpec, load_robot
+    return robot if robot is None or isinstance(robot, RobotSpec) else load_robot(robot)
+
+
 def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
-                 robot: Path | None = None, randomisation: str | None = None,
+                 robot: Path | RobotSpec | None = None,
+                 randomisation: str | Path | Randomisation | None = None,
                  max_decisions: int = 300, goal_seed: int = 0, odometry: str | None = None,
                  size: int | None = None, smallest: int = 0,
                  ranges: str | None = None, privileged: Collection[str] = (),
-                 say: Callable[[str], None] = SAY):
+                 say: Callable[[str], None] = SAY, **options):
     """A `NavigationEnv` in which a checkpoint is measured, on its own task.
 
     Args:
@@ -109,6 +124,7 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
         ranges: that its map is given; None: see `measurement.ranges_for`.
         privileged: what it tells beside the observations, to who measures.
         say: receives a line about what the simulator cannot vary.
+        options: further fields of `EnvConfig`; motion noise is else that of the training.
 
     Raises:
         UserError: the checkpoint belongs to another version of the simulator; the policy uses no
@@ -116,13 +132,12 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
     """
     from vn_nav.evaluation.measurement import odometry_for, ranges_for
     from vn_nav.observation import needed_side
-    from vn_nav.robot import load_robot
     info = checkpoint.info
+    robot = _loaded(robot)
     if size is None:
         size = checkpoint.config.size
         if robot is not None:  # which may have another camera: see `PolicyActor`
-            size = needed_side(size, load_robot(robot).camera_fov,
-                               math.radians(info['camera_fov_deg']))
+            size = needed_side(size, robot.camera_fov, math.radians(info['camera_fov_deg']))
     env = make_env(scenes, envs, robot=robot, size=max(size, smallest),
                    randomisation=randomisation or info['randomisation'], task=info['task'],
                    objects=info['objects'], actions=checkpoint.config.actions,
@@ -130,7 +145,8 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
                    goals_per_room=info['goals_per_room'] if own else 1,
                    odometry=odometry_for(checkpoint.network, odometry),
                    ranges=ranges_for(checkpoint.network, ranges), privileged=tuple(privileged),
-                   may_lack=() if randomisation else ('randomisation',), say=say)
+                   may_lack=() if randomisation else ('randomisation',), say=say,
+                   **(MOTION_NOISE[info['motion_noise']] | options))
     try:
         check_version(info, simulator=env.simulator_name, version=env.world_version)
     except UserError:
@@ -180,21 +196,15 @@ def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False)
     Raises:
         UserError: the robot has other actions or another camera.
     """
-    from vn_nav.observation import check_lens, crop_fraction
     from vn_nav.policy.checkpoint import load_checkpoint
-    from vn_nav.policy.network_config import SEARCH
-    from vn_nav.robot import load_robot
     checkpoint = load_checkpoint(path)
-    spec = load_robot(robot) if robot else _trained_robot(checkpoint.info)
+    spec = _loaded(robot) or _trained_robot(checkpoint.info)
     # Or says which action is unknown, or too long.
     spec = spec.with_actions(checkpoint.config.actions, checkpoint.config.moves)
     trained = checkpoint.info['camera_fov_deg'], checkpoint.info['camera_height']
     present = math.degrees(spec.camera_fov), spec.camera_height
     if any_camera and robot:
-        if checkpoint.config.architecture == SEARCH:
-            check_lens(spec.camera_fov)
-        else:
-            crop_fraction(spec.camera_fov, math.radians(trained[0]))
+        check_camera(checkpoint, spec.camera_fov)
     elif any(
             abs(a - b) > 0.01 * b for a, b in zip(present, trained, strict=True)):
         raise UserError('the robot has the camera that the policy was trained with: '
@@ -202,6 +212,20 @@ def load_for(path: Path, robot: Path | None = None, *, any_camera: bool = False)
                         f'{present[0]:g} deg, {present[1]:g} m (robot {spec.name})',
                         'give its file with --robot, or train a policy for this robot')
     return checkpoint, spec
+
+
+def check_camera(checkpoint, fov: float) -> None:
+    """Whether a policy can be shown the pictures of a camera with a field of view [rad].
+
+    Raises:
+        UserError: it sees too little or, for a policy that searches, too much.
+    """
+    from vn_nav.observation import check_lens, crop_fraction
+    from vn_nav.policy.network_config import SEARCH
+    if checkpoint.config.architecture == SEARCH:
+        check_lens(fov)
+    else:
+        crop_fraction(fov, math.radians(checkpoint.info['camera_fov_deg']))
 
 
 def _trained_robot(info: dict):

@@ -7,17 +7,16 @@ from there the map drifts against the place as the odometry does.
 from __future__ import annotations
 
 import bisect
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from vn_msgs_py.motion import odometry_to_array, quaternion_to_yaw
+from vn_msgs_py.motion import odometry_to_array
 from vn_nav.bags.mapping.pose_graph import between, compose
 from vn_nav.bags.storage.reader import read_bag
-from vn_nav.policy.search.snapshot import Guess, Snapshot, cut_to_known
+from vn_nav.policy.search.snapshot import Snapshot, snapshot_of
 
 BASE = 'base_link'  # frame of a map whose place in the odometry's frame nobody knew
 SAME_S = 1e-3  # stamps that differ by less are one
@@ -66,30 +65,15 @@ def read_searches(folder: str | Path, nodes: Sequence[str], begins: Sequence[flo
             continue  # nobody knows where the map lies
         # The odometry's frame in that of the place, by where the episode began.
         place = compose(starts[k][:3], between(first, np.zeros(3)))
-        search, origin = _snapshot(message, guessed.get((node, stamp)), own)
+        search, origin = snapshot_of(message, guessed.get((node, stamp)), own)
         found[k].append(PlacedSearch(recorded, stamp, search, compose(place, origin)))
     return found
-
-
-def _snapshot(message: Any, guesses: Any, robot: np.ndarray) -> tuple[Snapshot, np.ndarray]:
-    """A snapshot in a frame of its own, which lies at a pose [3] in that of the odometry."""
-    origin = _pose(message.info.origin)
-    cells = np.array(message.data, np.int8).reshape(message.info.height, message.info.width)
-    cells, corner = cut_to_known(cells, np.zeros(2), message.info.resolution)
-    poses = [] if guesses is None else [between(origin, _pose(pose)) for pose in guesses.poses]
-    return Snapshot(cells, corner, message.info.resolution, between(origin, robot),
-                    tuple(Guess(pose, math.nan) for pose in poses), '', math.nan), origin
 
 
 def _pose_at(odometry: list[np.ndarray], stamp: float) -> np.ndarray | None:
     """The pose [3] that odometry, in the order of time, has for a stamp [s]."""
     k = bisect.bisect_left(odometry, stamp - SAME_S, key=lambda values: values[6])
     return odometry[k][:3] if k < len(odometry) and odometry[k][6] <= stamp + SAME_S else None
-
-
-def _pose(message: Any) -> np.ndarray:
-    at, turn = message.position, message.orientation
-    return np.array([at.x, at.y, quaternion_to_yaw(turn.x, turn.y, turn.z, turn.w)])
 
 
 def _seconds(message: Any) -> float:

@@ -11,11 +11,11 @@ from vn_nav.errors import UserError
 from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.lens import zoom_of
 from vn_nav.observation import preprocess
+from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
-from vn_nav.policy.runtime import BatchedPolicy
 from vn_nav.policy.search.snapshot import Snapshot, snapshot
-from vn_nav.policy.search.verification import NONE
+from vn_nav.policy.search.views import NONE
 from vn_nav.policy.zhu import scene_numbers
 from vn_nav.robot import RobotSpec
 from vn_nav.vector_env import ExploringEnv, MeasuredVectorEnv
@@ -157,7 +157,8 @@ class PolicyActor:
             scanner=getattr(env, 'scanner', None),
             zoom=(max(zoom_of(env.robot.camera_fov, network.config.view), 1.0)
                   if network.config.architecture == SEARCH else 1.0),
-            verify=verify, camera_fov=env.robot.camera_fov, camera_pitch=env.robot.camera_pitch)
+            verify=verify, camera_fov=env.robot.camera_fov, camera_pitch=env.robot.camera_pitch,
+            max_decisions=env.config.max_decisions)
         self.filtered: np.ndarray | None = None
 
     def __call__(self, observation: dict, reset: np.ndarray) -> np.ndarray:

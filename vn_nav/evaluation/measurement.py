@@ -14,7 +14,7 @@ from vn_nav.policy.checkpoint import LoadedCheckpoint
 from vn_nav.policy.checkpoint_info import DECODINGS
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import SEARCH
-from vn_nav.policy.search.verification import NONE, check_verify
+from vn_nav.policy.search.views import NONE, check_verify
 from vn_nav.robot import RobotSpec
 
 

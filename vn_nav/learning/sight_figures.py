@@ -11,15 +11,9 @@ import torch
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.learning.auxiliary import POSE_OVERLAP
 from vn_nav.learning.sight_losses import WEIGHTS, range_loss, recognise, recognition_losses
-from vn_nav.policy.search.look import arrival_by_pose, median_ranges
-from vn_nav.policy.search.network import (
-    PER_AXIS,
-    Recognition,
-    SearchPolicy,
-    agreed,
-    heading_deviation,
-    mirrored,
-)
+from vn_nav.policy.search.eyes import Placed
+from vn_nav.policy.search.look import Recognition, arrival_by_pose, median_ranges
+from vn_nav.policy.search.network import SearchPolicy, agreed, mirrored
 
 BATCH = 128  # views
 # The hard ring: nearly there, or there but askew.
@@ -40,7 +34,7 @@ class Judged(NamedTuple):
     """What was said of K pairs and V views, and what is true."""
 
     position_error: np.ndarray  # [K] m
-    position_scale: np.ndarray  # [K] m, as said, see `vn_nav.policy.search.network.Recognition`
+    position_scale: np.ndarray  # [K] m, as said, see `vn_nav.policy.search.look.Recognition`
     bearing_error: np.ndarray  # [K] rad
     heading_error: np.ndarray  # [K] rad
     co_visible: np.ndarray  # [K] probability
@@ -94,19 +88,18 @@ def judge(network: SearchPolicy, batch: dict[str, np.ndarray], mirror: bool = Tr
     seen = Recognition(*(torch.cat(parts) for parts in zip(*said, strict=True)))
     log_ranges = torch.cat(ranges)
     parts = {**recognition_losses(seen, batch), 'ranges': range_loss(log_ranges, batch['ranges'])}
-    by_pose = torch.sigmoid(seen.co_visible) * arrival_by_pose(
-        seen.position, PER_AXIS * seen.log_scale.exp(), seen.heading,
-        heading_deviation(seen.log_concentration))
+    placed = Placed.of(Recognition(*(part.numpy() for part in seen)))
+    by_pose = torch.sigmoid(seen.co_visible).numpy() * arrival_by_pose(*placed[:4])
     truth = batch['goal_pose']
     position, heading = seen.position.numpy(), seen.heading.numpy()
     return Judged(
         np.hypot(*(position - truth[:, :2]).T), seen.log_scale.exp().numpy(),
         angle_between(position, truth[:, :2]), angle_between(heading, truth[:, 2:]),
         torch.sigmoid(seen.co_visible).numpy(), torch.sigmoid(seen.arrived).numpy(),
-        by_pose.numpy(),
+        by_pose,
         batch['overlap'], np.hypot(truth[:, 0], truth[:, 1]),
         np.abs(np.arctan2(truth[:, 3], truth[:, 2])), batch['arrived'],
-        median_ranges(log_ranges).numpy() / batch['ranges'],
+        median_ranges(log_ranges.numpy()) / batch['ranges'],
         {name: float(value) for name, value in parts.items()})
 
 

@@ -14,8 +14,8 @@ from torch.nn import functional as F
 from vn_nav.learning.auxiliary import POSE_OVERLAP
 from vn_nav.learning.returns import masked_mean
 from vn_nav.lens import SAME
-from vn_nav.policy.search.look import range_classes
-from vn_nav.policy.search.network import Recognition, SearchPolicy
+from vn_nav.policy.search.look import Recognition, range_classes
+from vn_nav.policy.search.network import SearchPolicy
 
 # A range is learned from one view in so many: pairs are harder to learn than ranges.
 RANGE_EVERY = 2

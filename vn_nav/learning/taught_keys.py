@@ -17,6 +17,7 @@ from vn_nav.policy.search.lens import in_metres
 from vn_nav.policy.search.look import RANGE_EDGES, column_bearings
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.search.taught import MOST_SIDE, TaughtPlace
+from vn_nav.policy.search.torch_eyes import TorchEyes
 
 KEY_M, KEY_RAD = 0.3, math.radians(25)  # a key picture stands for views about so near
 MOST_KEYS = 400  # beyond, key pictures are chosen farther apart
@@ -73,15 +74,16 @@ def recall_drive(network: SearchPolicy, pictures: np.ndarray, poses: np.ndarray,
                         f'{(high - low).max():.0f} m', 'teach a part of the drive (--pictures)')
     grid = OccupancyGrid(config.footprint, side, (low + high) / 2)
     bearings = column_bearings(config.view)
-    goal = network.encode_goals(torch.from_numpy(pictures[keys[:1]]))  # any: ranges have none
+    eyes = TorchEyes(network)
+    goal = eyes.encode_goals(pictures[keys[:1]])  # any: ranges have none
     # By key pictures alone: of views so near one another the ranges err together, and many of them
     # would outvote the walls that others see.
     for start in range(0, len(keys), BATCH):
         show(start / len(keys))
         rows = keys[start:start + BATCH]
-        look = in_metres(network.look(torch.from_numpy(pictures[rows]), goal,
-                                      torch.zeros(len(rows), dtype=torch.int64)), bearings, zoom)
-        for pose, own in zip(poses[rows], look.ranges.exp().numpy(), strict=True):
+        look = in_metres(eyes.look(pictures[rows], np.repeat(goal, len(rows), axis=0)), bearings,
+                         zoom)
+        for pose, own in zip(poses[rows], np.exp(look.ranges), strict=True):
             grid.add_ranges(pose, bearings_through(bearings, zoom), own, RANGE_EDGES)
     for pose in poses:
         grid.add_footprint(pose)

@@ -14,6 +14,7 @@ from rclpy.duration import Duration
 
 from vn_msgs_py import motion
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.tilt_output import TiltOutput
 from vn_nav.policy.clock_watch import ClockWatch
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.pose_track import PoseTrack
@@ -40,6 +41,7 @@ class CommandOutput:
         lock_step: one command for every odometry message instead.
         stamped: TwistStamped instead of Twist.
         name: of the topic.
+        tilt: takes the camera's tilt out of the commands; None: they carry its rate.
         patience: time without odometry after which lock-step sends a command unasked [s]; None:
             it never does.
 
@@ -52,11 +54,12 @@ class CommandOutput:
 
     def __init__(self, node, navigator: Navigator, wake: threading.Condition, *, period: float,
                  lock_step: bool, stamped: bool, name: str = TOPIC,
+                 tilt: TiltOutput | None = None,
                  patience: float | None = LOCK_STEP_SILENCE_S):
         self._node, self._navigator, self._wake = node, navigator, wake
         self._period, self._in_lock_step = period, lock_step
         self._is_running: Callable[[], bool] = lambda: False
-        self._stamped, self._patience = stamped, patience
+        self._stamped, self._patience, self._tilt = stamped, patience, tilt
         self.publisher = node.create_publisher(TwistStamped if stamped else Twist, name, qos(name))
         self.odometry: np.ndarray | None = None
         self.odometry_frame = 'odom'
@@ -230,6 +233,8 @@ class CommandOutput:
 
     def send(self, velocity: np.ndarray) -> None:
         """Publish a velocity [4]; only for the thread in `run`, or when it is gone."""
+        if self._tilt is not None:
+            velocity = self._tilt.without_tilt(velocity)
         if self._stamped:
             message = TwistStamped()
             message.header.stamp = self._node.get_clock().now().to_msg()

@@ -15,23 +15,26 @@ from std_msgs.msg import Bool, Int8, String
 
 from vn_msgs_py import images
 from vn_nav.nodes.command_output import CommandOutput
-from vn_nav.nodes.map_output import MapOutput
+from vn_nav.nodes.goal_output import GoalOutput
 from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.qos import qos
-from vn_nav.nodes.range_input import RangeInput
+from vn_nav.nodes.range_input import NamedRanges, RangeInput
 from vn_nav.nodes.window import Window
 from vn_nav.observation import needed_side
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.frame_gate import shorten
+from vn_nav.policy.goal_record import Code, ProgressWatch
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.policy.search.local_features import SIDE
-from vn_nav.policy.search.verification import SIFT, View
+from vn_nav.policy.search.views import SIFT, View
+from vn_nav.rectification import Camera
 
 WINDOW_S = 5.0  # that rates and latencies are measured over
 # That a picture waits for the ranges measured with it: scanners turn 10 times a second. In
 # lock-step only topics are not in order.
 RANGES_PATIENCE_S, LOCK_STEP_RANGES_PATIENCE_S = 0.15, 1.0
+NAMED_RANGES_PATIENCE_S = 10.0  # for those that a recording says belong to the picture
 
 
 class Executed(NamedTuple):
@@ -41,6 +44,8 @@ class Executed(NamedTuple):
     action: int  # -1: none of the policy's
     pose: np.ndarray | None  # [3] of odometry at the picture
     says_pose: bool  # else the topic of the odometry does
+    ranges: NamedRanges | None = None  # that belong to the picture; None: none do
+    says_ranges: bool = False  # else their topic does
 
 
 class DecisionWorker:
@@ -55,26 +60,35 @@ class DecisionWorker:
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
         shadow: decide only after `note_executed`, for a robot that somebody else drives.
         ranges: measured ranges for the map; None: it takes those that are seen in the pictures.
+        assumed_fov: of the shorter side [rad], of a camera that does not say; None: the policy's.
 
     Attributes:
-        camera_fov: field of view of the camera's shorter side [rad], as far as it is known.
+        camera: the robot's, as far as it is known.
         inferences: seconds that the decisions of the last while took.
         publishers: what `create_publisher` made.
+        goal_output: says where the goal stands.
     """
 
     def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
                  output: CommandOutput, wake: threading.Condition, *, lock_step: bool,
-                 shadow: bool = False, ranges: RangeInput | None = None):
+                 shadow: bool = False, ranges: RangeInput | None = None,
+                 assumed_fov: float | None = None):
         self._node, self._navigator, self._runtime = node, navigator, runtime
         self._output, self._wake, self._lock_step = output, wake, lock_step
         self._breaks = output.track.breaks  # of the odometry, that the runtime knows of
         self._shadow, self._ranges = shadow, ranges
         self._waits_from: float | None = None  # steady time [s]: pictures wait for ranges
-        self._map = None if runtime.search is None else MapOutput(node)
+        self._map = None
+        if runtime.search is not None:
+            from vn_nav.nodes.map_output import PERIOD_S, MapOutput  # with Numba
+            # Along a recording there is a map for each decision: it is awaited, and recorded.
+            self._map = MapOutput(node, 0.0 if shadow and lock_step else PERIOD_S)
         self._executed: Executed | None = None
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
-        self.camera_fov: float | None = None
-        self._camera_aspect = 1.0  # width of its pictures over their height
+        self.camera: Camera | None = None
+        self._assumed_fov = assumed_fov
+        # Of goal pictures that another camera took: the newest, and its stamp.
+        self._goal_camera: tuple[tuple[int, int], Camera] | None = None
         self._frame: tuple | None = None  # the newest message, its stamp, when it came
         self._goal: Image | None = None  # to be taken
         self._goal_in_force: Image | None = None
@@ -86,6 +100,10 @@ class DecisionWorker:
                 (Int8, 'action'), (String, 'action_names'), (Bool, 'arrived'))]
         names.publish(String(data=json.dumps(list(runtime.action_names))))
         self.publishers += [] if self._map is None else self._map.publishers
+        self.goal_output = GoalOutput(node, navigator)
+        self.publishers += self.goal_output.publishers
+        self._progress = ProgressWatch(navigator.goal_limits, navigator.robot)
+        self._watched: tuple | None = None  # which run at which goal the watch is of
         self.publish_arrival()
 
     def show_frame(self, message, stamp: float, received: float) -> None:
@@ -107,7 +125,8 @@ class DecisionWorker:
             self._wake.notify_all()
 
     def note_executed(self, stamp: float, action: str | None, pose: np.ndarray | None = None, *,
-                      says_pose: bool = False) -> None:
+                      says_pose: bool = False, ranges: NamedRanges | None = None,
+                      says_ranges: bool = False) -> None:
         """What the robot really did before the picture of a stamp, where a decision is wanted.
 
         Args:
@@ -115,34 +134,43 @@ class DecisionWorker:
             action: None: none of the policy's.
             pose: [3] x, y [m], yaw [rad] of odometry at the picture; None: unknown.
             says_pose: it is to be taken; else that of the topic is.
+            ranges: those that belong to the picture; None: none do.
+            says_ranges: it is to be waited for; else the nearest of the topic counts.
 
         Raises:
             ValueError: the policy does not know the action.
         """
         number = -1 if action is None else self._runtime.action_names.index(action)
         with self._wake:
-            self._executed = Executed(stamp, number, pose, says_pose)
+            self._executed = Executed(stamp, number, pose, says_pose, ranges, says_ranges)
             if self._frame is None and self._shown is not None and self._shown[1] >= stamp:
                 self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
 
-    def set_camera_fov(self, fov: float, aspect: float = 1.0) -> None:
-        """What the camera says of itself. The goal was cropped for what it said before.
+    @property
+    def camera_fov(self) -> float | None:
+        """Field of view of the camera's shorter side [rad], as far as it is known."""
+        camera = self.camera
+        return self._assumed_fov if camera is None else camera.fov
 
-        Args:
-            fov: field of view of the pictures' shorter side [rad].
-            aspect: their width over their height.
-        """
+    def set_camera(self, camera: Camera) -> None:
+        """What the camera says of itself. The goal was cut for what it said before."""
         with self._wake:
-            known = self.camera_fov is not None and math.isclose(
-                fov, self.camera_fov, rel_tol=1e-3) and math.isclose(
-                    aspect, self._camera_aspect, rel_tol=1e-3)
-            if known:
-                return
-            self.camera_fov, self._camera_aspect = fov, aspect
-            if self._goal is None and self._goal_in_force is not None:
-                self._goal = self._goal_in_force
-                self._wake.notify_all()
+            self.camera = camera
+            self._take_goal_again()
+
+    def set_goal_camera(self, stamp: tuple[int, int], camera: Camera) -> None:
+        """The camera that took the goal picture of a stamp, where it is not the robot's."""
+        with self._wake:
+            self._goal_camera = stamp, camera
+            # Topics are not in order: the picture may have come first.
+            if self._goal_in_force is not None and _stamp(self._goal_in_force) == stamp:
+                self._take_goal_again()
+
+    def _take_goal_again(self) -> None:
+        if self._goal is None and self._goal_in_force is not None:
+            self._goal = self._goal_in_force
+            self._wake.notify_all()
 
     def filter_values(self) -> dict[str, str | int]:
         """What diagnostics say of the action filter: its name, and its counts until now."""
@@ -155,7 +183,7 @@ class DecisionWorker:
     def check_fov(self) -> None:
         """Raise UserError where the camera sees less than the policy needs."""
         if self.camera_fov is not None:
-            self._runtime.check_camera(self.camera_fov, self._camera_aspect)
+            self._runtime.check_camera(self.camera_fov, self._aspect)
 
     def publish_arrival(self, *, again: bool = False) -> None:
         """Publish whether the robot stands where the policy has arrived, when that changed.
@@ -165,6 +193,7 @@ class DecisionWorker:
         """
         with self._wake:
             arrived = self._navigator.arrival is not None
+            self.goal_output.publish()
             if again or arrived != self._published:
                 self._published = arrived
                 self._arrived.publish(Bool(data=arrived))
@@ -185,9 +214,11 @@ class DecisionWorker:
 
     def _take_goal(self, message: Image) -> None:
         with self._wake:
+            again = message is self._goal_in_force
             self._goal_in_force = message
-        # A goal picture comes from a camera like this one; it is cropped the same way.
-        found = prepared(self._prepare, message, self._wake, self._refuse_goal)
+            budget = self._navigator.goal_limits.max_decisions
+        self._runtime.set_budget(budget or None)
+        found = prepared(self._prepare_goal, message, self._wake, self._refuse_goal)
         if found is None:
             return
         picture, _, view = found
@@ -196,12 +227,13 @@ class DecisionWorker:
             if self._goal is None:  # else a newer one is waiting
                 stamp = message.header.stamp
                 self._navigator.accept_goal(stamp.sec + stamp.nanosec * 1e-9 if self._lock_step
-                                            else -math.inf)
+                                            else -math.inf, again)
                 self.publish_arrival(again=True)
 
     def _refuse_goal(self, why: str) -> None:
         self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
         self._navigator.refuse_goal(why)
+        self.goal_output.publish()
 
     def _take_frame(self, message, stamp: float, received: float) -> None:
         found = prepared(self._prepare, message, self._wake,
@@ -218,7 +250,9 @@ class DecisionWorker:
             executed = self._executed if self._shadow else None
             if self._shadow and (executed is None or stamp < executed.stamp):
                 return
-            if not self._has_ranges(stamp):
+            if executed is not None and executed.says_ranges:
+                self._wait_for(executed.ranges)
+            elif not self._has_ranges(stamp):
                 return
             now = time.monotonic()
             ticket = self._navigator.request(stamp, now)
@@ -232,7 +266,11 @@ class DecisionWorker:
         if breaks != self._breaks:
             self._breaks = breaks
             self._runtime.reset_odometry()
-        scan = None if self._ranges is None else self._ranges.scan_at(stamp)
+        scan = None
+        if self._ranges is not None and executed is not None and executed.says_ranges:
+            scan = self._ranges.scan_of(executed.ranges, stamp, pose)
+        elif self._ranges is not None:
+            scan = self._ranges.scan_at(stamp)
         try:
             action = self._runtime.act(picture, pose, scan, zoom, view)
         except FloatingPointError as error:
@@ -245,16 +283,34 @@ class DecisionWorker:
             self.inferences.add(now, now - begun)
             if self._runtime.arrived:
                 self._navigator.declared(ticket, self._runtime.arrival, now)
-                self.publish_arrival()
+            elif ended := self._gets_nowhere(action, pose):
+                self._navigator.give_up(*ended)
             else:
                 # Still holding the lock: a receiver of it finds it decided, and no command for it
                 # is out yet.
                 if self._navigator.decided(ticket, action, now):
                     self._action.publish(Int8(data=action))
+            self.publish_arrival()
+            self.goal_output.decided(self._runtime.arrival, self._runtime.goal_estimate, pose,
+                                     self._output.odometry_frame, message.header.stamp)
             self._wake.notify_all()
         if self._map is not None and self._runtime.search is not None:
             self._map.publish(self._runtime.search.searchers[0], pose,
                               self._output.odometry_frame, message.header.stamp)
+
+    def _gets_nowhere(self, action: int, pose: np.ndarray | None) -> tuple[Code, str] | None:
+        """Why to give the goal up instead of doing an action; None: there is no reason."""
+        goal = self._navigator.goal
+        if (goal.number, goal.begun) != self._watched:
+            self._watched = goal.number, goal.begun
+            self._progress.reset()
+        return self._progress.decided(action, pose)
+
+    def _wait_for(self, ranges: NamedRanges | None) -> None:
+        """Wait for the ranges that a recording says belong to a picture; topics have no order."""
+        if self._ranges is not None and ranges is not None:
+            own, stamp = self._ranges, ranges.stamp
+            self._wake.wait_for(lambda: own.has_exactly(stamp), timeout=NAMED_RANGES_PATIENCE_S)
 
     def _has_ranges(self, stamp: float) -> bool:
         """Wait a moment for the ranges measured with a picture that a decision needs.
@@ -281,8 +337,40 @@ class DecisionWorker:
 
     def _prepare(self, message) -> tuple[np.ndarray, float, View | None]:
         """A picture for the policy, its zoom, and all of it where the policy verifies."""
-        fov, verifies = self.camera_fov, self._runtime.verify == SIFT
-        smallest = needed_side(self._runtime.size, fov, self._runtime.camera_fov)
-        whole = images.decode_rgb(message, max(smallest, SIDE) if verifies else smallest)
-        view = View(whole, fov or self._runtime.camera_fov) if verifies else None
-        return *self._runtime.prepare(whole, fov), view
+        camera, fov = self.camera, self.camera_fov
+        picture = self._decode(message, camera)
+        return self._show(picture if camera is None else camera.rectify(picture), fov)
+
+    def _prepare_goal(self, message: Image) -> tuple[np.ndarray, float, View | None]:
+        """As `_prepare`: cut or padded to what the robot's camera shows the policy."""
+        camera, fov, other = self.camera, self.camera_fov, self._goal_camera
+        if other is not None and other[0] == _stamp(message):
+            picture = other[1].rectify(self._decode(message, other[1]))
+            return self._show(picture, other[1].fov, self._runtime.zoom_of(fov, self._aspect))
+        picture = self._decode(message, camera)
+        if camera is not None and camera.fits(picture):
+            picture = camera.rectify(picture)
+        # Else it is of another camera, which nobody describes: as wide as the robot's.
+        return self._show(picture, fov)
+
+    @property
+    def _aspect(self) -> float:
+        """Width of the camera's pictures over their height."""
+        return 1.0 if self.camera is None else self.camera.aspect
+
+    def _decode(self, message, camera: Camera | None) -> np.ndarray:
+        size, target = self._runtime.size, self._runtime.camera_fov
+        smallest = (needed_side(size, self.camera_fov, target) if camera is None
+                    else camera.needed_side(size, target))
+        return images.decode_rgb(message, max(smallest, SIDE) if self._runtime.verify == SIFT
+                                 else smallest)
+
+    def _show(self, picture: np.ndarray, fov: float | None, zoom: float | None = None
+              ) -> tuple[np.ndarray, float, View | None]:
+        view = (View(picture, fov or self._runtime.camera_fov) if self._runtime.verify == SIFT
+                else None)
+        return *self._runtime.prepare(picture, fov, zoom), view
+
+
+def _stamp(message) -> tuple[int, int]:
+    return message.header.stamp.sec, message.header.stamp.nanosec

@@ -15,7 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.nodes.qos import qos
@@ -112,17 +112,37 @@ class DemoWatch:
         before = self._before or {}
         self._wait_for(lambda: all(self._received.get(name, 0) > before.get(name, 0)
                                    for name in self._met), 'the recorder hears bridge and policy')
-        client = self._node.create_client(SetBool, f'/{self._policy}/enable')
+        self._ask_until_done(SetBool, 'enable', SetBool.Request(data=True))
+
+    @property
+    def stopped(self) -> bool:
+        """The policy has latched a stop: somebody has to look, and let it go on."""
+        return self.said.startswith('stopped')
+
+    def resume(self) -> None:
+        """Let a policy go on that has latched a stop.
+
+        Raises:
+            ProcessFailure: a child has died, or it refuses.
+        """
+        self.said = 'resumed'  # until its next status
+        self._ask_until_done(Trigger, 'reset', Trigger.Request())
+        self._ask_until_done(SetBool, 'enable', SetBool.Request(data=True))
+
+    def _ask_until_done(self, kind: Any, name: str, request: Any) -> None:
+        """Ask the policy for something until it agrees."""
+        client = self._node.create_client(kind, f'/{self._policy}/{name}')
         self._wait_for(client.service_is_ready, f'{client.srv_name} is there')
         until = time.monotonic() + PATIENCE_S
         while True:
-            call = ServiceCall(client, SetBool.Request(data=True))
+            call = ServiceCall(client, request)
             self._wait_for(call.is_answered, f'{client.srv_name} answers')
             if call.answer.success:
-                return
+                break
             if time.monotonic() > until:
-                raise ProcessFailure(f'the policy refuses to drive: {call.answer.message}')
+                raise ProcessFailure(f'the policy refuses to {name}: {call.answer.message}')
             self.spin(0.1)
+        self._node.destroy_client(client)
 
     def _wait_for(self, condition, what: str) -> None:
         until = time.monotonic() + PATIENCE_S

@@ -14,7 +14,8 @@ from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.navigator import State
 
 MAX_WARNINGS = 5
-LEVELS = {State.STOPPED: DiagnosticStatus.ERROR, State.HOLD: DiagnosticStatus.WARN}
+LEVELS = {State.STOPPED: DiagnosticStatus.ERROR, State.HOLD: DiagnosticStatus.WARN,
+          State.FAILED: DiagnosticStatus.WARN}
 
 
 class Diagnosis:

@@ -11,16 +11,14 @@ import sys
 from pathlib import Path
 
 from rclpy.node import Node
-from sensor_msgs.msg import Image
 
-from vn_msgs_py.images import fill_image
 from vn_nav.errors import UserError
 from vn_nav.goal_picture import read_goal_picture
 from vn_nav.nodes import parameters, policy_parameters
+from vn_nav.nodes.goal_publisher import GoalPublisher
 from vn_nav.nodes.process import run_node, spin
-from vn_nav.nodes.qos import qos
 
-PARAMETERS = {'picture': ('', "JPEG or PNG, taken by the robot's camera")}
+PARAMETERS = {'picture': ('', "JPEG, PNG or HEIC, of the robot's camera or a phone")}
 
 
 class GoalNode(Node):
@@ -34,12 +32,9 @@ class GoalNode(Node):
         if not path.is_file():
             raise UserError('the goal is a picture file', given,
                             'give one with --ros-args -p picture:=kitchen.jpg')
-        picture = read_goal_picture(path)
-        self.publisher = self.create_publisher(Image, 'goal_image', qos('goal_image'))
-        message = fill_image(Image(), picture, 'rgb8')
-        message.header.stamp = self.get_clock().now().to_msg()
-        self.publisher.publish(message)
-        self.get_logger().info(f'showing {path}, {picture.shape[1]} x {picture.shape[0]}')
+        picture, fov = read_goal_picture(path)
+        shown = GoalPublisher(self).show(picture, fov)
+        self.get_logger().info(f'showing {path}, {shown}')
 
 
 def main(args=None) -> int:

@@ -6,35 +6,35 @@ import math
 import time
 
 import numpy as np
-from geometry_msgs.msg import Pose, PoseArray
+from geometry_msgs.msg import PoseArray
 from nav_msgs.msg import OccupancyGrid
 
-from vn_msgs_py.motion import yaw_to_quaternion
 from vn_nav.bags.mapping.pose_graph import between, compose
+from vn_nav.nodes.goal_output import BASE, pose_message
 from vn_nav.nodes.qos import qos
 from vn_nav.policy.search.grid import CELL
 from vn_nav.policy.search.searcher import Searcher
 
-PERIOD_S = 1.0  # of steady time, between two maps at least
-BASE = 'base_link'
+PERIOD_S = 1.0  # who looks at the map wants no more
 
 
 class MapOutput:
-    """Publishes the map when somebody listens, once a second at most.
+    """Publishes the map when somebody listens.
 
     Args:
         node: that publishes.
+        period: s of steady time between two maps at least.
 
     Attributes:
         publishers: what was made.
     """
 
-    def __init__(self, node):
+    def __init__(self, node, period: float = PERIOD_S):
         self._map = node.create_publisher(OccupancyGrid, '~/map', qos('policy_node/map'))
         self._hypotheses = node.create_publisher(PoseArray, '~/hypotheses',
                                                  qos('policy_node/hypotheses'))
         self.publishers = [self._map, self._hypotheses]
-        self._due = -math.inf
+        self._due, self._period = -math.inf, period
 
     def publish(self, searcher: Searcher, pose: np.ndarray | None, frame: str, stamp) -> None:
         """Publish what a searcher knows, if it is time and somebody listens.
@@ -50,7 +50,7 @@ class MapOutput:
         listened = [publisher.get_subscription_count() > 0 for publisher in self.publishers]
         if now < self._due or not any(listened):
             return
-        self._due = now + PERIOD_S
+        self._due = now + self._period
         # The searcher's map lies in a frame of its own, which begins with the episode.
         base = np.zeros(3) if pose is None else pose
         begin = compose(base, between(searcher.pose, np.zeros(3)))
@@ -60,7 +60,7 @@ class MapOutput:
         if listened[1]:
             best = sorted(searcher.hypotheses.all, key=lambda own: -own.weight)
             self._publish(self._hypotheses, PoseArray(
-                poses=[_pose(compose(begin, own.pose)) for own in best]), frame, stamp)
+                poses=[pose_message(compose(begin, own.pose)) for own in best]), frame, stamp)
 
     @staticmethod
     def _publish(publisher, message, frame: str, stamp) -> None:
@@ -74,14 +74,6 @@ def _map_message(searcher: Searcher, begin: np.ndarray) -> OccupancyGrid:
     cells = grid.occupancy()
     message.info.resolution = CELL
     message.info.height, message.info.width = cells.shape
-    message.info.origin = _pose(compose(begin, np.array([*grid.origin, 0.0])))
+    message.info.origin = pose_message(compose(begin, np.array([*grid.origin, 0.0])))
     message.data.frombytes(cells.tobytes())
-    return message
-
-
-def _pose(pose: np.ndarray) -> Pose:
-    message = Pose()
-    message.position.x, message.position.y = float(pose[0]), float(pose[1])
-    (message.orientation.x, message.orientation.y, message.orientation.z,
-     message.orientation.w) = yaw_to_quaternion(float(pose[2]))
     return message

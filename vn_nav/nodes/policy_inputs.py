@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
-import math
 import threading
 import time
 
@@ -13,17 +13,17 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 
-from vn_msgs_py.camera import field_of_view
+from vn_nav.calibration import assumed_calibration, is_rectified, read_calibration
+from vn_nav.errors import UserError
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.decision_worker import WINDOW_S, DecisionWorker
 from vn_nav.nodes.qos import other_types, qos, subscribe
-from vn_nav.nodes.range_input import RangeInput
+from vn_nav.nodes.range_input import NamedRanges, RangeInput
 from vn_nav.nodes.window import Window
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import ENABLED, Navigator
-
-CAMERA_FOV_RAD = (math.radians(5), math.radians(170))  # what a pinhole camera can have
+from vn_nav.rectification import Camera
 
 
 class PolicyInputs:
@@ -39,15 +39,21 @@ class PolicyInputs:
         lock_step: stamps are the simulator's ticks, and nothing is late.
         shadow: somebody else drives, and publishes what was done.
         ranges: measured ranges, for the diagnostics; None: there are none.
+        rectify: of `vn_nav.calibration.RECTIFY`: whether pictures are to be rectified by
+            camera_info.
+        target_fov: that the policy needs [rad].
+        assumed_fov: of a camera that is not calibrated [rad]; None: it is not driven by.
 
     Attributes:
         subscriptions: what was made.
+        camera_fault: why nothing is known of the camera though it has a camera_info; else empty.
         odometry_topic: its resolved name.
     """
 
     def __init__(self, node, navigator: Navigator, worker: DecisionWorker, output: CommandOutput,
                  wake: threading.Condition, *, compressed: bool, lock_step: bool, shadow: bool,
-                 ranges: RangeInput | None = None):
+                 ranges: RangeInput | None = None, rectify: str = 'auto',
+                 target_fov: float = 0.0, assumed_fov: float | None = None):
         self._node, self._navigator, self._worker, self._output = node, navigator, worker, output
         self._wake, self._lock_step, self._ranges = wake, lock_step, ranges
         self._goals = GoalWatch(trust_stamps=lock_step)
@@ -56,11 +62,15 @@ class PolicyInputs:
         self.subscriptions: list = []
         image, kind = (('image_raw/compressed', CompressedImage) if compressed else
                        ('image_raw', Image))
-        self._subscribe(image, kind, self._on_image)
+        topic = self._subscribe(image, kind, self._on_image)
+        self._is_rectified = is_rectified(topic) if rectify == 'auto' else rectify == 'never'
+        self._target_fov, self._assumed_fov = target_fov, assumed_fov
+        self.camera_fault = ''
         self._subscribe('camera_info', CameraInfo, self._on_camera_info)
         self._subscribe('goal_image', Image, self._on_goal)
         # In lock-step no message may be missed, and the simulator is reliable.
         self.odometry_topic = self._subscribe('odom', Odometry, self._on_odometry, exact=lock_step)
+        self._subscribe('goal_camera_info', CameraInfo, self._on_goal_camera_info)
         if shadow:
             self._subscribe('executed_action', String, self._on_executed_action, exact=True)
 
@@ -103,6 +113,18 @@ class PolicyInputs:
                 self._navigator.new_goal()
                 self._worker.show_goal(message)
 
+    def take_goal(self, message: Image, camera: CameraInfo | None, max_decisions: int,
+                  seconds: float) -> None:
+        """A goal that did not come on the topic, with limits of its own; 0: the usual one."""
+        with self._wake:
+            if camera is not None:
+                self._on_goal_camera_info(camera)
+            usual = self._navigator.usual_limits
+            self._navigator.new_goal(dataclasses.replace(
+                usual, max_decisions=max_decisions or usual.max_decisions,
+                time_allowance=seconds or usual.time_allowance))
+            self._worker.show_goal(message)
+
     def _on_odometry(self, message: Odometry) -> None:
         self._odometry.add(time.monotonic())
         self._output.take_odometry(message)
@@ -114,25 +136,46 @@ class PolicyInputs:
             pose = executed.get('odometry')
             self._worker.note_executed(
                 sec + nanosec * 1e-9, executed['action'],
-                None if pose is None else _pose(pose), says_pose='odometry' in executed)
+                None if pose is None else _pose(pose), says_pose='odometry' in executed,
+                ranges=_named(executed.get('ranges')), says_ranges='ranges' in executed)
         except Exception as error:  # whatever somebody writes there
             self._node.get_logger().error(
                 "executed_action is JSON with stamp [sec, nanosec], an action's name or null and, "
-                'if anything, odometry [x, y, yaw] or null; '
+                'if anything, odometry [x, y, yaw] or null, and ranges, null or with stamp and '
+                'odometry of their own; '
                 f'received {shorten(message.data)!r}: {shorten(repr(error))}')
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        side, focal = min(message.width, message.height), message.k[0]
-        if side <= 0 or focal == 0:
-            return  # an uncalibrated camera says zero
-        fov = field_of_view(side, side, focal)
-        if not CAMERA_FOV_RAD[0] <= fov <= CAMERA_FOV_RAD[1]:
-            least, most = map(math.degrees, CAMERA_FOV_RAD)
+        known = self._worker.camera
+        try:
+            calibration = read_calibration(message, rectified=self._is_rectified)
+            if calibration is None and self._assumed_fov is not None:
+                calibration = assumed_calibration(message, self._assumed_fov)
+            if calibration is None:
+                raise UserError('camera_info has the focal length of the camera',
+                                'zeros: it is not calibrated',
+                                'calibrate it (camera_calibration), or declare what it sees with '
+                                '-p camera_fov:=DEGREES')
+            if known is None or not known.calibration.is_near(calibration):
+                self._worker.set_camera(Camera(calibration, self._target_fov))
+            self.camera_fault = ''
+        except Exception as error:  # whatever somebody publishes there
+            if known is None:
+                self.camera_fault = shorten(str(error) or repr(error))
+            self._node.get_logger().error(shorten(str(error) or repr(error)),
+                                          throttle_duration_sec=10.0)
+
+    def _on_goal_camera_info(self, message: CameraInfo) -> None:
+        stamp = message.header.stamp
+        try:
+            calibration = read_calibration(message)
+            if calibration is not None:
+                self._worker.set_goal_camera((stamp.sec, stamp.nanosec),
+                                             Camera(calibration, self._target_fov))
+        except Exception as error:  # as above
             self._node.get_logger().error(
-                f'a camera sees {least:.0f} to {most:.0f} deg; camera_info says '
-                f'{math.degrees(fov):.3g}: calibrate the camera', throttle_duration_sec=10.0)
-            return
-        self._worker.set_camera_fov(fov, message.width / message.height)
+                f'goal_camera_info refused: {shorten(str(error) or repr(error))}',
+                throttle_duration_sec=10.0)
 
     # What is missing or wrong with them.
 
@@ -150,7 +193,7 @@ class PolicyInputs:
 
     def warnings(self) -> list[str]:
         """What is wrong with the inputs though the robot may drive."""
-        warnings = self.unreceived()
+        warnings = self.unreceived() + [self.camera_fault] * bool(self.camera_fault)
         if goals := self._goals.warning(time.monotonic()):
             warnings.append(goals)
         if (self._output.odometry is None and not self._lock_step and not warnings
@@ -176,6 +219,13 @@ def _pose(values: object) -> np.ndarray:
     if pose.shape != (3,) or not np.isfinite(pose).all():
         raise ValueError('a pose is x, y and yaw')
     return pose
+
+
+def _named(ranges: dict | None) -> NamedRanges | None:
+    if ranges is None:
+        return None
+    (sec, nanosec), pose = ranges['stamp'], ranges['odometry']
+    return NamedRanges(sec + nanosec * 1e-9, None if pose is None else _pose(pose))
 
 
 def _milliseconds(seconds: float | None) -> str:

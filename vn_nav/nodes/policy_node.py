@@ -9,7 +9,7 @@ Run: `ros2 run vn_nav policy_node --ros-args -p checkpoint:=models/house`.
 
 from __future__ import annotations
 
-import os
+import math
 import sys
 import threading
 import time
@@ -20,15 +20,18 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
 from vn_nav.errors import UserError
+from vn_nav.measured_ranges import RangeSource
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.command_output import LOCK_STEP_SILENCE_S, TOPIC, CommandOutput
 from vn_nav.nodes.decision_worker import DecisionWorker
 from vn_nav.nodes.policy_inputs import PolicyInputs
 from vn_nav.nodes.policy_operation import Operation
 from vn_nav.nodes.process import Ended, run_node
-from vn_nav.nodes.range_input import RangeInput, RangeSource
+from vn_nav.nodes.range_input import RangeInput
+from vn_nav.nodes.tilt_output import TiltOutput
 from vn_nav.nodes.work_threads import WorkThreads
 from vn_nav.policy.frame_gate import shorten
+from vn_nav.policy.goal_record import GoalLimits
 from vn_nav.policy.navigator import Limits, Navigator
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.resources import share_file
@@ -114,37 +117,46 @@ class PolicyNode(LifecycleNode):
                             inference_timeout=limit, odometry_timeout=limit, settle_time=0.0)
         else:
             limits = Limits(**{name: value[name] for name in Limits.__dataclass_fields__})
-        self.navigator = Navigator(robot, limits, continuous=value['mode'] != 'stop_and_go',
-                                   exact=self.lock_step)
+        self.navigator = Navigator(
+            robot, limits, continuous=value['mode'] != 'stop_and_go', exact=self.lock_step,
+            goal_limits=GoalLimits(
+                value['goal_decisions'], value['goal_timeout'], value['progress_decisions'],
+                value['progress_radius'], value['blocked_moves']))
+        period = 1.0 / value['control_rate']
+        self._tilt = TiltOutput(self, value['tilt_topic'], period, robot.camera_pitch) if (
+            value['tilt_topic'] and not shadow) else None
         self._output = CommandOutput(
-            self, self.navigator, self._wake, period=1.0 / value['control_rate'],
+            self, self.navigator, self._wake, period=period, tilt=self._tilt,
             lock_step=self.lock_step, stamped=value['enable_stamped_cmd_vel'],
             # In a shadow nothing waits for commands: each answers odometry or a decision.
             name=f'shadow/{TOPIC}' if shadow else TOPIC,
             patience=None if shadow else LOCK_STEP_SILENCE_S)
         self._ranges = RangeInput(self, self.navigator, self._output, self._wake, source,
                                   robot) if source else None
+        assumed_fov = math.radians(value['camera_fov']) or None
         self._worker = DecisionWorker(self, self.navigator, runtime, self._output, self._wake,
                                       lock_step=self.lock_step, shadow=shadow,
-                                      ranges=self._ranges)
-        self._require_odometry = value['require_odometry']
+                                      ranges=self._ranges, assumed_fov=assumed_fov)
+        self._require_odometry, self._shadow = value['require_odometry'], shadow
         self._inputs = PolicyInputs(self, self.navigator, self._worker, self._output, self._wake,
                                     compressed=value['image_transport'] == 'compressed',
                                     lock_step=self.lock_step, shadow=shadow,
-                                    ranges=self._ranges)
+                                    ranges=self._ranges, rectify=value['rectify'],
+                                    target_fov=runtime.camera_fov, assumed_fov=assumed_fov)
         self._make_interfaces()
 
     def _make_interfaces(self) -> None:
         self._operation = Operation(
             self, self.navigator, self._worker, self._output, self._inputs, self._wake,
             self._steady, lock_step=self.lock_step, auto_enable=self.auto_enable,
-            require_odometry=self._require_odometry)
+            require_odometry=self._require_odometry, takes_goals=not self._shadow)
         self._interfaces = [
             *((self.destroy_subscription, subscription)
               for subscription in (*self._inputs.subscriptions,
                                    *(self._ranges.subscriptions if self._ranges else ()))),
             *((self.destroy_publisher, publisher) for publisher in (
-                self._output.publisher, *self._worker.publishers)),
+                self._output.publisher, *self._worker.publishers,
+                *((self._tilt.publisher,) if self._tilt else ()))),
         ]
 
     def on_activate(self, state) -> TransitionCallbackReturn:
@@ -219,9 +231,13 @@ class PolicyNode(LifecycleNode):
         return (self.lock_step or not self.get_parameter('use_sim_time').value
                 or self.get_clock().now().nanoseconds > 0)
 
+    def close(self) -> None:
+        """Stand still."""
+        self.halt('the process ends')
+
     def destroy_node(self) -> None:
         """Zero first, then everything else."""
-        self.halt('the process ends')
+        self.close()
         super().destroy_node()
 
     def halt(self, reason: str) -> bool:
@@ -302,15 +318,8 @@ def _transit(node: PolicyNode, transition) -> None:
 
 def main(args=None) -> int:
     """Entry point: 0 after a signal, 2 and one line on standard error for bad input."""
-    status = run_node('policy_node', lambda _: PolicyNode(), drive, args, about=__doc__,
-                      parameters=policy_parameters.PARAMETERS)
-    if any(thread.name == 'inference' for thread in threading.enumerate()):
-        # It sits in a decision that does not end. The zero is delivered, everything is closed;
-        # to leave in the ordinary way would abort the process.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-    return status
+    return run_node('policy_node', lambda _: PolicyNode(), drive, args, about=__doc__,
+                    parameters=policy_parameters.PARAMETERS)
 
 
 if __name__ == '__main__':

@@ -10,10 +10,12 @@ from rclpy.clock import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.errors import UserError
+from vn_nav.nodes import navigate_action
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.decision_worker import DecisionWorker
 from vn_nav.nodes.diagnosis import Diagnosis
 from vn_nav.nodes.policy_inputs import PolicyInputs
+from vn_nav.policy.goal_record import Status
 from vn_nav.policy.navigator import ENABLED, Navigator, State
 
 WARNINGS_PERIOD_S = 0.9  # to look at the graph takes a while
@@ -34,11 +36,13 @@ class Operation:
         lock_step: odometry is the clock.
         auto_enable: enable motion as soon as it is possible.
         require_odometry: no motion without odometry.
+        takes_goals: serve the action `navigate_to_image`, where its type is installed.
     """
 
     def __init__(self, node, navigator: Navigator, worker: DecisionWorker, output: CommandOutput,
                  inputs: PolicyInputs, wake: threading.Condition, steady: Clock, *,
-                 lock_step: bool, auto_enable: bool, require_odometry: bool):
+                 lock_step: bool, auto_enable: bool, require_odometry: bool,
+                 takes_goals: bool = True):
         self._node, self._navigator, self._wake = node, navigator, wake
         self._worker, self._output, self._inputs = worker, output, inputs
         self._lock_step, self._auto_enable = lock_step, auto_enable
@@ -50,6 +54,11 @@ class Operation:
         self._services = [node.create_service(SetBool, '~/enable', self._on_enable),
                           node.create_service(Trigger, '~/stop', self._on_stop),
                           node.create_service(Trigger, '~/reset', self._on_reset)]
+        self._action = None
+        if (kind := navigate_action.action_type()) is not None and takes_goals:
+            self._action = navigate_action.NavigateAction(
+                node, kind, navigator, inputs.take_goal, self._enable,
+                lambda: self._node.is_running, worker.goal_output)
         self._timer = node.create_timer(TIMER_PERIOD_S, self._on_timer, clock=steady)
 
     def end(self) -> None:
@@ -57,6 +66,8 @@ class Operation:
         self._ended = True
         for service in self._services:
             self._node.destroy_service(service)
+        if self._action is not None:
+            self._action.destroy()
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._diagnosis.publisher)
 
@@ -91,6 +102,8 @@ class Operation:
             blockers.append(f'odometry is silent: check {self._inputs.odometry_topic}')
         if others := self.other_publishers():
             blockers.append(f'{others} other publisher(s) on cmd_vel: remap one')
+        if self._inputs.camera_fault:
+            blockers.append(self._inputs.camera_fault)
         try:
             self._worker.check_fov()
         except UserError as error:
@@ -99,7 +112,9 @@ class Operation:
 
     def _on_stop(self, _request, response):
         with self._wake:
-            self._navigator.stop('~/stop was called', time.monotonic())
+            now = time.monotonic()
+            self._navigator.goal.end(Status.CANCELLED, now, message='~/stop was called')
+            self._navigator.stop('~/stop was called', now)
             self._worker.publish_arrival()
             self._wake.notify_all()
         response.success, response.message = True, 'stopped: ~/reset, then ~/enable to go on'
@@ -125,6 +140,8 @@ class Operation:
                     self._enable()
                 self._worker.publish_arrival()
                 self._wake.notify_all()
+            if self._action is not None:
+                self._action.tend()
         self.diagnose()
 
     def other_publishers(self) -> int:
@@ -147,9 +164,13 @@ class Operation:
                 reason = 'the node is not active'
             fov, gate, broken = (
                 self._worker.camera_fov, self._navigator.gate, self._node.broken)
+            camera = self._worker.camera
             values = {'decisions': self._navigator.decisions, **self._worker.filter_values(),
                       **self._inputs.values(),
                       'camera_fov_deg': round(math.degrees(fov), 1) if fov else 'unknown',
+                      'camera_model': ('unknown' if camera is None else
+                                       'pinhole' if camera.is_pinhole else
+                                       f'{camera.calibration.model}, rectified'),
                       **{f'dropped: {kind}': n for kind, n in gate.dropped.items()},
                       **({'last_dropped': gate.last} if gate.last else {}),
                       **({'broken': broken} if broken else {})}

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from vn_nav.calibration import RECTIFY
 from vn_nav.errors import UserError
 from vn_nav.nodes import parameters
-from vn_nav.policy.search.verification import NONE, VERIFY
+from vn_nav.policy.search.views import NONE, VERIFY
 
 # The watchdog's limits in lock-step, of wall time.
 LOCK_STEP_LIMIT_S = 2.0
 
 # name: (default, meaning, limits or None), as in `vn_nav.nodes.parameters`.
 PARAMETERS = {
-    'checkpoint': ('', 'folder of the policy; empty: the shipped models/house', None),
+    'checkpoint': ('', 'folder of the policy, or of its export; empty: the shipped models/house',
+                   None),
     'robot': ('', 'YAML file of the robot; empty: the standard robot', None),
     'mode': ('stop_and_go', 'stop_and_go; continuous: a decision at every frame; shadow: another '
                             'driver has control, see docs/architecture.md',
@@ -21,7 +23,15 @@ PARAMETERS = {
     'time': ('real_time', 'real_time, or lock_step for the sim bridge in lock_step',
              ('real_time', 'lock_step')),
     'image_transport': ('raw', 'raw, or compressed: image_raw/compressed', ('raw', 'compressed')),
+    'rectify': ('auto', 'whether pictures are rectified by camera_info: auto: unless their topic '
+                        'is called image_rect; never; always', RECTIFY),
+    'camera_fov': (0.0, "declared field of view of the pictures' shorter side [deg], for a "
+                        'camera whose camera_info is not calibrated or missing; 0: none',
+                   (0.0, 170.0)),
     'enable_stamped_cmd_vel': (False, 'publish TwistStamped instead of Twist', None),
+    'tilt_topic': ('', 'std_msgs/Float64MultiArray with the position of a joint that tilts the '
+                       'camera [rad, positive down]; empty: the Twist carries the rate of tilting '
+                       '(angular.y)', None),
     'autostart': (True, 'configure and activate at the start', None),
     'auto_enable': (False, 'enable motion as soon as it is possible (simulators only)', None),
     'seed': (0, 'of the sampled actions', None),
@@ -31,6 +41,17 @@ PARAMETERS = {
                              'so, 0 to 1 (1: never); -1: as the checkpoint says', (-1.0, 1.0)),
     'verify': (NONE, 'none, or sift: what a policy that searches sees of its goal is verified by '
                      'local features of the full pictures; for cameras, not simulators', VERIFY),
+    'goal_decisions': (0, 'decisions for a goal, after which it has failed; a policy that '
+                          'searches turns back to its best guess in time; 0: any number',
+                       (0, 2**31 - 1)),
+    'goal_timeout': (0.0, 'time for a goal from ~/enable on, after which it has failed [s]; 0: '
+                          'any', (0.0, 86_400.0)),
+    'progress_decisions': (0, 'decisions in a row within progress_radius after which a goal has '
+                              'failed; 0: never', (0, 2**31 - 1)),
+    'progress_radius': (0.5, 'of the circle that counts as one place, by odometry [m]',
+                        (0.05, 10.0)),
+    'blocked_moves': (0, 'moves in a row that are cut off, by odometry, after which a goal has '
+                         'failed; 0: never', (0, 2**31 - 1)),
     'control_rate': (20.0, 'commands per second [Hz]', (5.0, 100.0)),
     'frame_timeout': (0.25, 'time without pictures after which the robot stands still [s]',
                       (0.05, 5.0)),
@@ -65,6 +86,9 @@ def check(name: str, value: object) -> None:
     if name == 'stop_threshold' and isinstance(value, float) and -1.0 < value < 0.0:
         raise UserError('stop_threshold lies in [0, 1], or is -1', value,
                         'set it with -p stop_threshold:=...')
+    if name == 'camera_fov' and isinstance(value, float) and 0.0 < value < 5.0:
+        raise UserError('camera_fov lies in [5, 170] deg, or is 0', value,
+                        'set it with -p camera_fov:=DEGREES')
 
 
 def read(node, names: Iterable[str] = tuple(PARAMETERS)) -> dict:

@@ -32,6 +32,10 @@ __all__ = ['Ended', 'compiling', 'run_node', 'spin']
 _ros: Any = rclpy._rclpy_pybind11  # type: ignore[attr-defined]  # compiled, without types
 REFUSED = (NameValidationException, ParameterException,
            _ros.RCLError, _ros.RCLInvalidROSArgsError, _ros.UnknownROSArgsError)
+# For the middleware to leave the graph. Fast DDS does it in milliseconds; where another
+# participant leaves at the same moment, once in some hundred times never: set_listener of its
+# DomainParticipant spins on a lock that the discovery's callback waits for (Fast DDS, issue 6513).
+TEARDOWN_S = 3
 AnyNode = TypeVar('AnyNode', bound=Node)
 USAGE = """usage: ros2 run vn_nav {name} [--ros-args [-p name:=value] [--params-file file]
        [-r topic:=other] [-r __ns:=/namespace] [--log-level debug|info|warn|error|fatal]]
@@ -54,9 +58,13 @@ def run_node(name: str, make: Callable[[Ended], AnyNode],
              parameters: Mapping[str, tuple] | None = None) -> int:
     """Make a node, work until a signal, destroy it. Afterwards the process has to end.
 
+    With the process's own command line the process ends here, once the node has let go of
+    everything: taking Python apart would cost seconds, and wait for a decision that does not end.
+
     Args:
         name: of the program, in front of its error line.
-        make: builds the node; its `destroy_node` lets go of everything.
+        make: builds the node. A method `close` of its own lets go of all but the graph;
+            `destroy_node` calls it first, and it may be called twice.
         work: returns when it is done, or soon after a signal.
         args: command line without the program; None: the process's own.
         about, parameters: what `--help` says: a text, and the table of `vn_nav.nodes.parameters`.
@@ -90,10 +98,16 @@ def run_node(name: str, make: Callable[[Ended], AnyNode],
         pass
     finally:
         if node is not None:
-            node.destroy_node()
+            if args is None and hasattr(node, 'close'):
+                node.close()
+            with signals.leaving_within(TEARDOWN_S, code) if args is None else (
+                    contextlib.nullcontext()):
+                node.destroy_node()
         rclpy.try_shutdown()
-        signals.ignore()  # the interpreter would otherwise end by the next one, in its shutdown
+        signals.ignore()  # the process ends anyway
         _flush()
+    if args is None:
+        os._exit(code)
     return code
 
 
@@ -118,7 +132,8 @@ def compiling(node: Node, ended: Ended, work: str, period: float = 5.0) -> Itera
             node.get_logger().info(f'{work}: {time.monotonic() - begun:.0f} s so far')
 
     def let_go():
-        Node.destroy_node(node)
+        with signals.leaving_within(TEARDOWN_S, 0):
+            Node.destroy_node(node)
         rclpy.try_shutdown()
     thread = threading.Thread(target=say, daemon=True)
     thread.start()

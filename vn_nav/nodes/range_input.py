@@ -14,7 +14,7 @@ from vn_msgs_py.images import decode_depth
 from vn_msgs_py.topics import topic
 from vn_nav.bags.mapping.pose_graph import between
 from vn_nav.errors import UserError
-from vn_nav.measured_ranges import DepthCamera, Scan, laser_scan
+from vn_nav.measured_ranges import DepthCamera, RangeSource, Scan, laser_scan
 from vn_nav.nodes.command_output import POSE_AGE_S, CommandOutput
 from vn_nav.nodes.qos import other_types, profile
 from vn_nav.nodes.window import Window
@@ -29,39 +29,11 @@ WARNING_PERIOD_S = 10.0
 WINDOW_S = 5.0
 
 
-class RangeSource(NamedTuple):
-    """Where measured ranges come from.
+class NamedRanges(NamedTuple):
+    """The message of measured ranges that belongs to a picture, as a recording says."""
 
-    Attributes:
-        scan: name of a topic of LaserScan; '': none.
-        depth: name of a topic of depth pictures, with `camera_info` beside it; '': none.
-        mount: x ahead, y to the left [m], yaw [rad] of the sensor on the robot.
-    """
-
-    scan: str
-    depth: str
-    mount: tuple[float, float, float]
-
-    def __bool__(self) -> bool:
-        return bool(self.scan or self.depth)
-
-    def check(self) -> None:
-        """Raise `UserError` where both topics are named."""
-        if self.scan and self.depth:
-            raise UserError('the map takes ranges from one topic',
-                            f'scan_topic {self.scan}, depth_topic {self.depth}',
-                            'leave one of them empty')
-
-    def check_policy(self, searches: bool) -> None:
-        """Raise `UserError` where a topic is named for a policy that has no map.
-
-        Args:
-            searches: it has one.
-        """
-        if self and not searches:
-            named = f'scan_topic {self.scan}' if self.scan else f'depth_topic {self.depth}'
-            raise UserError('measured ranges are for policies that search with a map',
-                            f'{named}; this one has none', 'leave it empty')
+    stamp: float  # s, its own
+    pose: np.ndarray | None  # [3] of odometry when it was measured; None: unknown
 
 
 class RangeInput:
@@ -127,6 +99,13 @@ class RangeInput:
         """Whether there is a message that belongs to a picture of this stamp; `wake` is held."""
         return self._best(stamp) is not None
 
+    def has_exactly(self, stamp: float) -> bool:
+        """Whether the message of a stamp is there; `wake` is held."""
+        return self._message(stamp) is not None
+
+    def _message(self, stamp: float) -> Any:
+        return next((message for own, message in self._messages if own == stamp), None)
+
     def _best(self, stamp: float) -> tuple[float, Any] | None:
         """The message nearest to a picture: of the same rest, or of about the same moment."""
         near = [one for one in self._messages
@@ -144,17 +123,43 @@ class RangeInput:
             None: there is none, it is too old, or it is refused.
         """
         with self._wake:
-            best, moved = self._best(stamp), None
+            best, then, now = self._best(stamp), None, None
             if best is not None and self._navigator.continuous:
                 then, now = (self._output.track.at(at, POSE_AGE_S) for at in (best[0], stamp))
-                if then is not None and now is not None:
-                    moved = between(now, then)
-                elif abs(best[0] - stamp) > SAME_MOMENT_S:
-                    best = None
-        scan = None if best is None else self._read(best[1])
+        if best is None:
+            return self._counted(None)
+        if not self._navigator.continuous:  # at rest
+            return self._counted(self._read(best[1]))
+        return self._in_motion(*best, then, stamp, now)
+
+    def scan_of(self, named: NamedRanges | None, stamp: float, pose: np.ndarray | None
+                ) -> Scan | None:
+        """As `scan_at`, of the message that a recording says belongs to the picture.
+
+        Args:
+            named: the message; None: there is none.
+            stamp: of the picture [s]; pose: [3] of odometry there; None: unknown.
+        """
+        with self._wake:
+            message = None if named is None else self._message(named.stamp)
+        if named is None or message is None:
+            return self._counted(None)
+        return self._in_motion(named.stamp, message, named.pose, stamp, pose)
+
+    def _in_motion(self, measured: float, message: Any, then: np.ndarray | None, stamp: float,
+                   now: np.ndarray | None) -> Scan | None:
+        """A message of one stamp as seen at another; poses [3] of odometry, None: unknown."""
+        known = then is not None and now is not None
+        if not known and abs(measured - stamp) > SAME_MOMENT_S:
+            return self._counted(None)
+        scan = self._counted(self._read(message))
+        return scan if scan is None or then is None or now is None else (
+            scan.seen_from(between(now, then)))
+
+    def _counted(self, scan: Scan | None) -> Scan | None:
         self.used += scan is not None
         self.missed += scan is None
-        return scan if scan is None or moved is None else scan.seen_from(moved)
+        return scan
 
     def _read(self, message) -> Scan | None:
         try:

@@ -71,7 +71,7 @@ class RecorderNode(Node):
                                 min_free=value['min_free_space'])
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics',
                                                  qos('/diagnostics'))
-        self.stopped = False
+        self.stopped = self.closed = False
         self.warned: set[str] = set()  # what is logged once
         self.known_publishers: set[str] = set()  # nodes that publish what is recorded
         self.lost_said = 0
@@ -117,8 +117,11 @@ class RecorderNode(Node):
             self.report_at = now + REPORT_PERIOD_S
             self._report()
 
-    def destroy_node(self) -> None:
+    def close(self) -> None:
         """Finish the bag and say what is in it."""
+        if self.closed:
+            return
+        self.closed = True
         try:
             self.writer.close()
         except RecordingStopped as error:
@@ -131,6 +134,10 @@ class RecorderNode(Node):
                 self.get_logger().info(f'{in_bag(tap.topic.name)}: {tap.received} received, '
                                        f'{kept} written, {lost}')
         self.get_logger().info(f'{written.total()} messages recorded')
+
+    def destroy_node(self) -> None:
+        """Finish the bag first."""
+        self.close()
         super().destroy_node()
 
     def _wanted(self, entry: str) -> Topic | None:

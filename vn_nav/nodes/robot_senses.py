@@ -18,8 +18,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Bool, Float32, String, UInt8
 
 from vn_msgs_py import images
-from vn_msgs_py.camera import field_of_view
 from vn_nav.bags.stamped import STAMP_WINDOW_S
+from vn_nav.calibration import is_rectified, read_calibration
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.recorded_topics import RecordedTopics
@@ -28,6 +28,7 @@ from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.pose_track import EpisodePose
+from vn_nav.rectification import Camera
 from vn_nav.robot import RobotSpec
 
 # What comes with a picture, by the key of `info`: topic and decoder.
@@ -74,7 +75,7 @@ class Senses:
         goals: number of goals that were taken.
         scene: what a simulator publishes of itself; empty: none does.
         label_names: behind the class ids of labels; empty: none are published.
-        camera_fov: of the pictures [rad]; None: unknown.
+        camera: that takes the pictures; None: unknown.
         frame: stamp [s] and picture, the newest of the present goal.
         tally: what came since the last decision.
     """
@@ -92,7 +93,7 @@ class Senses:
         self.goals = 0
         self.scene: dict = {}
         self.label_names: tuple[str, ...] = ()
-        self.camera_fov: float | None = None
+        self.camera: Camera | None = None
         self.frame: tuple[float, np.ndarray] | None = None
         self.tally = Tally()
         # Outcomes come first: of what has arrived, the executor serves the oldest subscription
@@ -107,8 +108,9 @@ class Senses:
         # In lock-step no odometry may be missed, and the simulator is reliable.
         topics.subscribe(Odometry, 'odom', output.take_odometry, anybody=not lock_step)
         topics.subscribe(CameraInfo, 'camera_info', self._on_camera_info)
-        topics.subscribe(*((CompressedImage, 'image_raw/compressed') if compressed else
-                           (Image, 'image_raw')), self._on_image)
+        picture = (CompressedImage, 'image_raw/compressed') if compressed else (Image, 'image_raw')
+        self._is_rectified = is_rectified(node.resolve_topic_name(picture[1]))
+        topics.subscribe(*picture, self._on_image)
 
     def listen(self, keys: tuple[str, ...]) -> None:
         """Have the maps of these keys of `MAP_TOPICS` with every picture."""
@@ -205,9 +207,14 @@ class Senses:
                 self._wake.notify_all()
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        side, focal = min(message.width, message.height), message.k[0]
-        if side > 0 and math.isfinite(focal) and focal > 0:
-            self.camera_fov = field_of_view(side, side, focal)
+        try:
+            calibration = read_calibration(message, rectified=self._is_rectified)
+            if calibration is not None and (
+                    self.camera is None or not self.camera.calibration.is_near(calibration)):
+                self.camera = Camera(calibration, self._robot.camera_fov)
+        except Exception as error:  # whatever somebody publishes there
+            self._node.get_logger().error(shorten(str(error) or repr(error)),
+                                          throttle_duration_sec=10.0)
 
     def sees(self) -> bool:
         """Whether there is a picture to decide on, and what belongs to it."""
@@ -230,17 +237,22 @@ class Senses:
         maps = {}
         for key, rows in self._maps.items():
             decoded = MAP_TOPICS[key][1](_nearest(rows, stamp))
+            if self.camera is not None and self.camera.fits(decoded):
+                decoded = self.camera.rectify(decoded, nearest=True)
             maps[key] = np.nan_to_num(preprocess_map(decoded, self._size, **self._lens()))
         return Seen(picture, odometry if self._knows_pose else None, maps)
 
     def _prepare(self, message) -> np.ndarray:
-        lens = self._lens()
-        smallest = needed_side(self._size, **lens)
-        return preprocess(images.decode_rgb(message, smallest), self._size, **lens)
+        camera = self.camera
+        if camera is None:
+            return preprocess(images.decode_rgb(message, needed_side(self._size)), self._size)
+        smallest = camera.needed_side(self._size, self._robot.camera_fov)
+        picture = camera.rectify(images.decode_rgb(message, smallest))
+        return preprocess(picture, self._size, **self._lens())
 
     def _lens(self) -> dict[str, float]:
-        return {} if self.camera_fov is None else {
-            'fov': self.camera_fov, 'target_fov': self._robot.camera_fov}
+        return {} if self.camera is None else {
+            'fov': self.camera.fov, 'target_fov': self._robot.camera_fov}
 
     def _now(self) -> float:
         return self._node.get_clock().now().nanoseconds * 1e-9

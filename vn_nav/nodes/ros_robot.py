@@ -176,8 +176,8 @@ class RosRobot(Node):
                             'end the other node, or remap one of them')
         self._readiness.wait_until(lambda: not self._missing(),
                                    lambda: f'waits for {", ".join(self._missing())}')
-        if self._senses.camera_fov is not None:
-            crop_fraction(self._senses.camera_fov, self.robot.camera_fov)
+        if self._senses.camera is not None:
+            crop_fraction(self._senses.camera.fov, self.robot.camera_fov)
         self._threads = WorkThreads({'output': self.output.run}, self._on_failed_thread).start()
 
     def _missing(self) -> list[str]:

@@ -18,11 +18,12 @@ from pathlib import Path
 
 from vn_nav.bags.shadow.plan import Plan
 from vn_nav.bags.storage.writer import BagWriter
+from vn_nav.calibration import is_rectified
 from vn_nav.errors import UserError
 from vn_nav.nodes.process import Ended
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.nodes.shadow_domain import DOMAINS, Domain
-from vn_nav.nodes.shadow_stage import ABSOLUTE, Stage, shadow_topics
+from vn_nav.nodes.shadow_stage import ABSOLUTE, Stage, range_parameters, shadow_topics
 
 
 @dataclasses.dataclass
@@ -35,7 +36,8 @@ class Driven:
 
 
 def drive(plan: Plan, checkpoint: str | Path, out: str | Path, *, robot: Path | None = None,
-          decoding: str | None = None, domains: Iterable[int] = DOMAINS,
+          decoding: str | None = None, searches: bool = False,
+          mount: tuple[float, float, float] = (0.0, 0.0, 0.0), domains: Iterable[int] = DOMAINS,
           say: Callable[[str], None] = lambda _: None) -> Driven:
     """Let a policy see a drive, and record what it would have done.
 
@@ -45,6 +47,8 @@ def drive(plan: Plan, checkpoint: str | Path, out: str | Path, *, robot: Path | 
         out: folder of the second bag; it must not exist.
         robot: YAML file; None: the standard robot.
         decoding: 'sample' or 'greedy'; None: as the checkpoint was measured.
+        searches: the policy has a map; it is recorded.
+        mount: x ahead, y to the left [m], yaw [rad] of the sensor of `plan.ranges` on the robot.
         domains: to choose from.
         say: called with a line about where the commands end.
 
@@ -55,18 +59,21 @@ def drive(plan: Plan, checkpoint: str | Path, out: str | Path, *, robot: Path | 
     ended = Ended()
     try:
         with (Domain(domains) as domain, tempfile.TemporaryDirectory() as logs,
-              BagWriter(out, shadow_topics()) as bag):
+              BagWriter(out, shadow_topics(searches)) as bag):
             say(f'ROS domain {domain.number}, namespace {domain.namespace}: the commands end '
                 'there')
             processes = Processes(Path(logs))
             processes.environment['ROS_DOMAIN_ID'] = str(domain.number)
-            stage = Stage(plan, domain, bag, processes, ended)
+            stage = Stage(plan, domain, bag, processes, ended, searches=searches)
             try:
                 processes.start('policy', 'vn_nav.nodes.policy_node', {
                     'checkpoint': str(checkpoint), 'robot': str(robot or ''), 'mode': 'shadow',
                     'time': 'lock_step', 'use_sim_time': True, 'control_rate': plan.rate,
                     'image_transport': 'compressed' if plan.compressed else 'raw',
-                    'decoding': decoding or ''}, (
+                    # The topic has another name there.
+                    'rectify': 'never' if is_rectified(plan.topics.image) else 'always',
+                    'decoding': decoding or '',
+                    **range_parameters(plan, mount)}, (
                         f'__ns:={domain.namespace}',
                         *(f'/{name}:={domain.namespace}/{name}' for name in ABSOLUTE)))
                 complete = stage.play()

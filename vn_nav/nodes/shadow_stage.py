@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import json
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Twist
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import PoseArray, Twist
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, LaserScan
 from std_msgs.msg import Bool, Int8, String
 from std_srvs.srv import SetBool
 
+from vn_msgs_py.camera import fill_camera_info
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import twist_to_array
 from vn_msgs_py.topics import Topic, topic
@@ -39,24 +42,50 @@ ARMING_NS = 10_000_000_000, 1_000_000  # ns before the drive, and between the pi
 SUBSCRIBED = {'shadow/cmd_vel': Twist, 'action': Int8, 'action_names': String, 'arrived': Bool,
               'diagnostics': DiagnosticArray}
 # What it is shown, besides the pictures.
-PUBLISHED = {'camera_info': CameraInfo, 'odom': Odometry, 'goal_image': Image, 'clock': Clock,
+PUBLISHED = {'camera_info': CameraInfo, 'goal_camera_info': CameraInfo,
+             'odom': Odometry, 'goal_image': Image, 'clock': Clock,
              'executed_action': String}
+# Of a policy that searches.
+MAPS = {'policy_node/map': OccupancyGrid, 'policy_node/hypotheses': PoseArray}
 ABSOLUTE = ('clock', 'diagnostics')  # in the contract; here they are in the namespace as well
+
+
+SCAN, DEPTH, DEPTH_INFO = 'scan', 'depth/image_raw', 'depth/camera_info'
 
 
 class _Interrupted(Exception):
     """A signal has come."""
 
 
-def shadow_topics() -> list[Topic]:
-    """What the second bag holds. Below /shadow: playing it moves no robot either."""
+def shadow_topics(searches: bool) -> list[Topic]:
+    """What the second bag holds. Below /shadow: playing it moves no robot either.
+
+    Args:
+        searches: the policy has a map.
+    """
     return [dataclasses.replace(topic(_contract(name)), name=in_bag(name))
-            for name in (*SUBSCRIBED, 'goal_image', 'executed_action')]
+            for name in (*SUBSCRIBED, *(MAPS if searches else ()), 'goal_image',
+                         'executed_action')]
 
 
 def in_bag(name: str) -> str:
     """The name of a topic in the second bag."""
     return f'/shadow/{name.removeprefix("shadow/")}'
+
+
+def _range_topics(plan: Plan) -> dict[str, type]:
+    """What measured ranges come on, if they are asked for."""
+    if not plan.ranges:
+        return {}
+    return {SCAN: LaserScan} if plan.depth_info is None else {DEPTH: Image, DEPTH_INFO: CameraInfo}
+
+
+def range_parameters(plan: Plan, mount: tuple[float, float, float]) -> dict[str, str | float]:
+    """Parameters of the node for measured ranges; mount: of the sensor, see `shadow.drive`."""
+    if not plan.ranges:
+        return {}
+    where = dict(zip(('scan_x', 'scan_y', 'scan_yaw'), map(float, mount), strict=True))
+    return where | ({'scan_topic': SCAN} if plan.depth_info is None else {'depth_topic': DEPTH})
 
 
 def _contract(name: str) -> str:
@@ -72,10 +101,11 @@ class Stage:
         bag: for what it says.
         processes: with the child `policy`.
         ended: says that a signal has come.
+        searches: the policy has a map, which it publishes after each decision.
     """
 
     def __init__(self, plan: Plan, domain: Domain, bag: BagWriter, processes: Processes,
-                 ended: Ended):
+                 ended: Ended, *, searches: bool = False):
         self._plan, self._domain, self._bag = plan, domain, bag
         self._processes, self._ended = processes, ended
         self.latencies: list[float] = []
@@ -83,14 +113,15 @@ class Stage:
         image, kind = (('image_raw/compressed', CompressedImage) if plan.compressed
                        else ('image_raw', Image))
         self._out = {name: node.create_publisher(kind, name, qos(_contract(name)))
-                     for name, kind in (PUBLISHED | {image: kind}).items()}
+                     for name, kind in (PUBLISHED | {image: kind} | _range_topics(plan)).items()}
         self._image = self._out[image]
         self._enabler = node.create_client(SetBool, 'policy_node/enable')
         callbacks = {
             'shadow/cmd_vel': self._on_command, 'action': self._on_action,
             'action_names': self._on_names, 'arrived': self._on_arrived,
-            'diagnostics': self._on_diagnostics}
-        for name, kind in SUBSCRIBED.items():
+            'diagnostics': self._on_diagnostics,
+            **dict.fromkeys(MAPS, self._on_map)}
+        for name, kind in (SUBSCRIBED | (MAPS if searches else {})).items():
             node.create_subscription(kind, name, self._recording(name, kind, callbacks[name]),
                                      qos(_contract(name), depth=100), raw=True)
         self._log_time = 0  # ns, by which the second bag has what is said now
@@ -109,6 +140,9 @@ class Stage:
         self._picture: bytes | None = None
         self._picture_stamp = 0
         self._shown_at = 0.0
+        self._ranges: bytes | None = None  # beside the picture
+        self._maps: collections.Counter[int] = collections.Counter()  # by stamp [ns]
+        self._maps_each = len(MAPS) if searches else 0  # of a decision
 
     # What the policy says.
 
@@ -136,6 +170,10 @@ class Stage:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self._diagnosis = {pair.key: pair.value for pair in message.status[0].values}
 
+    def _on_map(self, message: OccupancyGrid | PoseArray) -> None:
+        stamp = message.header.stamp
+        self._maps[stamp.sec * 10**9 + stamp.nanosec] += 1
+
     # What it is shown.
 
     def play(self) -> bool:
@@ -155,10 +193,16 @@ class Stage:
     def _wait_for_last_counts(self) -> None:
         """Diagnostics come once a second: those after the last decision belong in the bag."""
         end = time.monotonic() + DIAGNOSTICS_TIMEOUT_S
-        while (int(self._diagnosis.get('filter_decisions', len(self.latencies)))
-               < len(self.latencies) and time.monotonic() < end):
+        while self._counted() < len(self.latencies) and time.monotonic() < end:
             self._check()
             self._domain.executor.spin_once(timeout_sec=0.05)
+
+    def _counted(self) -> int:
+        """Decisions in the newest diagnostics, by what counts them."""
+        said = self._diagnosis
+        if self._plan.ranges:
+            return int(said.get('ranges_used', 0)) + int(said.get('ranges_missed', 0))
+        return int(said.get('filter_decisions', len(self.latencies)))
 
     def _take(self, event: Event) -> None:
         self._log_time = max(self._log_time, event.log_time)
@@ -177,15 +221,23 @@ class Stage:
         elif self._has_arrived:
             self._look_again()
         stamp = max(event.stamp, self._picture_stamp + STAMP_RESOLUTION_NS)
-        executed = String(data=json.dumps({'stamp': divmod(stamp, 10**9),
-                                           'action': decision.done,
-                                           'odometry': decision.pose}))
+        said: dict[str, Any] = {'stamp': divmod(stamp, 10**9), 'action': decision.done,
+                                'odometry': decision.pose}
+        if self._plan.ranges:
+            near = event.ranges
+            said['ranges'] = None if near is None else {
+                'stamp': divmod(near.stamp, 10**9), 'odometry': near.pose}
+            self._ranges = None if near is None else stamped(near.data, near.stamp)
+        executed = String(data=json.dumps(said))
         self._out['executed_action'].publish(executed)
         self._bag.write(in_bag('executed_action'), serialize_message(executed), self._log_time)
         self._choice, begun = None, time.monotonic()
         self._show(event.picture_data, stamp)
         self._until(lambda: self._choice is not None, 'a decision', resend=True)
         self.latencies.append(time.monotonic() - begun)
+        self._until(lambda: self._maps[stamp] >= self._maps_each, 'the map')
+        self._maps.clear()
+        self._ranges = None
         if self.latencies[-1] > SHADOW_LIMIT_S:  # the node has discarded it
             raise UserError(f'a decision takes less than {SHADOW_LIMIT_S:g} s',
                             f'{self.latencies[-1]:.1f} s',
@@ -206,9 +258,12 @@ class Stage:
             self._until(lambda: self._statements and self._names, 'the policy node to be active')
         elif self._has_arrived:
             self._look_again()
-        goal = fill_image(Image(), picture)
+        goal = fill_image(Image(), picture.picture)
         goal.header.stamp.sec, goal.header.stamp.nanosec = divmod(
             event.stamp - 2 * STAMP_RESOLUTION_NS, 10**9)
+        if picture.fov is not None:
+            self._out['goal_camera_info'].publish(fill_camera_info(
+                CameraInfo(header=goal.header), goal.width, goal.height, picture.fov))
         said = self._statements
         self._out['goal_image'].publish(goal)
         self._bag.write(in_bag('goal_image'), serialize_message(goal), self._log_time)
@@ -233,6 +288,8 @@ class Stage:
             self._image.publish(stamped(event.picture_data, stamp))
             if self._plan.camera_info is not None:
                 self._out['camera_info'].publish(stamped(self._plan.camera_info, event.stamp))
+            if self._plan.depth_info is not None:
+                self._out[DEPTH_INFO].publish(stamped(self._plan.depth_info, event.stamp))
             self._domain.executor.spin_once(timeout_sec=0.03)
             self._check()
             camera = self._diagnosis.get('camera_fov_deg', 'unknown') != 'unknown'
@@ -263,6 +320,12 @@ class Stage:
         self._picture_stamp = max(stamp, self._picture_stamp + STAMP_RESOLUTION_NS)
         self._picture = stamped(data, self._picture_stamp)
         self._set_clock(self._picture_stamp)
+        self._publish_picture()
+
+    def _publish_picture(self) -> None:
+        """The picture, and what was measured with it."""
+        if self._ranges is not None:
+            self._out[SCAN if self._plan.depth_info is None else DEPTH].publish(self._ranges)
         self._image.publish(self._picture)
         self._shown_at = time.monotonic()
 
@@ -303,8 +366,7 @@ class Stage:
                                 f'waited for {what}; it says {self._state()}',
                                 'try again when the machine is less busy')
             if resend and time.monotonic() - self._shown_at > REPEAT_PERIOD_S:
-                self._image.publish(self._picture)  # pictures may be lost; it knows one it has
-                self._shown_at = time.monotonic()
+                self._publish_picture()  # pictures may be lost; it knows one that it has
             self._domain.executor.spin_once(timeout_sec=0.05)
 
     def _check(self) -> None:

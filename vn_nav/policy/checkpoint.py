@@ -12,7 +12,6 @@ import hashlib
 import json
 import math
 import os
-import reprlib
 import shutil
 from pathlib import Path
 
@@ -27,7 +26,6 @@ from vn_nav.policy.checkpoint_info import (
     CHECKSUM,
     CONFIG,
     FORMAT,
-    NUMBER,
     PLACE,
     PLACE_CHECKSUM,
     WEIGHTS,
@@ -37,13 +35,12 @@ from vn_nav.policy.checkpoint_info import (
 )
 from vn_nav.policy.model_card import model_card
 from vn_nav.policy.network import Policy
-from vn_nav.policy.network_config import NetworkConfig
+from vn_nav.policy.network_config import NetworkConfig, no_network, read_network
 from vn_nav.policy.search.network import SearchPolicy
 from vn_nav.policy.taught_file import place_bytes, read_place
 from vn_nav.policy.zhu_policy import build_policy
 
 HEADER_BYTES = 1_000_000  # of a safetensors file, without its weights
-MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,27 +76,9 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
                             'go back to an earlier checkpoint, or store them in 32 bits')
         tensors[name] = stored.contiguous()
     weights = safetensors.torch.save(tensors)
-    config = {
-        'format': FORMAT,
-        'network': dataclasses.asdict(network.config),
-        'action_names': list(network.config.actions),
-        'sha256': hashlib.sha256(weights).hexdigest(),
-        **info,
-    }
-    place = network.taught if isinstance(network, SearchPolicy) else None
-    files = {WEIGHTS: weights}
-    if place is not None:
-        files[PLACE] = place_bytes(place)
-        config[PLACE_CHECKSUM] = hashlib.sha256(files[PLACE]).hexdigest()
-    del config['network']['actions']  # said once, under action_names
-    config['network']['action_filter'] = network.config.filter_name
-    try:
-        # As it will be read: JSON has no tuples, and only text as keys.
-        config = json.loads(json.dumps(config, allow_nan=False))
-        config[CHECKSUM] = config_checksum(config)
-        text = json.dumps(config, indent=2, allow_nan=False) + '\n'
-    except (TypeError, ValueError) as error:
-        raise UserError('info holds only JSON values', str(error), 'convert them first') from error
+    place = taught_bytes(network)
+    config, text = config_file(network, info, hashlib.sha256(weights).hexdigest(), place)
+    files = {WEIGHTS: weights} if place is None else {WEIGHTS: weights, PLACE: place}
     parameters = sum(tensor.numel() for tensor in tensors.values())
     files |= {CONFIG: text.encode(), CARD: model_card(config, parameters, len(weights)).encode()}
     try:
@@ -109,6 +88,38 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
                         f'{error.filename or folder}: {error.strerror}',
                         'free some space, or choose a folder that may be written: the checkpoint '
                         'before is whole') from error
+
+
+def taught_bytes(network: Policy) -> bytes | None:
+    """The file of the place that a policy was taught; None: of none."""
+    place = network.taught if isinstance(network, SearchPolicy) else None
+    return None if place is None else place_bytes(place)
+
+
+def config_file(network: Policy, info: dict, digest: str, place: bytes | None
+                ) -> tuple[dict, str]:
+    """What `config.json` says of a checkpoint, and the file's text.
+
+    Args:
+        network: the policy; info: all keys of `INFO`.
+        digest: SHA-256 of the weights' file; place: of `taught_bytes`.
+
+    Raises:
+        UserError: a value that JSON cannot hold.
+    """
+    config = {'format': FORMAT, 'network': dataclasses.asdict(network.config),
+              'action_names': list(network.config.actions), 'sha256': digest, **info}
+    if place is not None:
+        config[PLACE_CHECKSUM] = hashlib.sha256(place).hexdigest()
+    del config['network']['actions']  # said once, under action_names
+    config['network']['action_filter'] = network.config.filter_name
+    try:
+        # As it will be read: JSON has no tuples, and only text as keys.
+        config = json.loads(json.dumps(config, allow_nan=False))
+        config[CHECKSUM] = config_checksum(config)
+        return config, json.dumps(config, indent=2, allow_nan=False) + '\n'
+    except (TypeError, ValueError) as error:
+        raise UserError('info holds only JSON values', str(error), 'convert them first') from error
 
 
 def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None = None
@@ -124,9 +135,10 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
             wrong type or size, or other actions.
     """
     folder = Path(folder)
-    config, info = read_config(folder)
+    config, info = read_config(folder, (WEIGHTS,))
     where = str(folder / CONFIG)
-    network_config, shapes = _read_network(config, where)
+    network_config = read_network(config, where)
+    shapes = _shapes(network_config, where)
     if expect_actions is not None and tuple(expect_actions) != network_config.actions:
         raise UserError(f'the policy has the actions {", ".join(expect_actions)}, in that order',
                         ', '.join(network_config.actions), 'use a checkpoint trained for them')
@@ -147,52 +159,17 @@ def load_checkpoint(folder: str | Path, expect_actions: tuple[str, ...] | None =
     return LoadedCheckpoint(network.eval(), network_config, {**info, 'sha256': digest})
 
 
-def _read_network(config: dict, where: str) -> tuple[NetworkConfig, dict[str, tuple]]:
-    """The network of a `config.json`, and the shapes of its weights by name.
+def _shapes(network: NetworkConfig, where: str) -> dict[str, tuple]:
+    """The shapes of a network's weights by name.
 
-    The shapes come from a network without memory: an absurd size must not be allocated.
+    They come from a network without memory: an absurd size must not be allocated.
     """
-    names, given = config['action_names'], config['network']
-    if not (isinstance(names, list) and len(names) <= 256
-            and all(isinstance(name, str) for name in names)):
-        raise UserError('action_names is a list of at most 256 names',
-                        f'{where}: {reprlib.repr(names)}', 'get the checkpoint again')
-    if not isinstance(given, dict):
-        raise UserError(f'the network in {CONFIG} is a mapping', f'{where}: {reprlib.repr(given)}',
-                        'get the checkpoint again')
-    fields = {field.name: field.default for field in dataclasses.fields(NetworkConfig)
-              if field.name != 'actions'}
-    for name, value in given.items():
-        if name not in fields:
-            raise UserError(f'the network in {CONFIG} has only the fields {", ".join(fields)}',
-                            f'{where}: {name}', 'use the version of vn_nav that wrote it, or '
-                            'train again')
-        if not _fits(value, fields[name]):
-            raise UserError(f'{name} of the network in {CONFIG} is of the type and '
-                            f'size of {fields[name]!r}', f'{where}: {reprlib.repr(value)}',
-                            'get the checkpoint again')
     try:
-        network = NetworkConfig(actions=tuple(names), **given)
         with torch.device('meta'):
-            shapes = {name: tuple(tensor.shape)
-                      for name, tensor in build_policy(network).state_dict().items()}
+            return {name: tuple(tensor.shape)
+                    for name, tensor in build_policy(network).state_dict().items()}
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise UserError(f'the network in {CONFIG} can be built',
-                        f'{where}: {" ".join(str(error).split())[:200]}',
-                        'get the checkpoint again') from error
-    return network, shapes
-
-
-def _fits(value: object, default: object) -> bool:
-    """Whether a value out of JSON has the type of a field of `NetworkConfig`."""
-    if isinstance(default, tuple):
-        return isinstance(value, list) and all(
-            isinstance(part, (str, int)) or (isinstance(part, list) and all(
-                _fits(number, 0.0) for number in part)) for part in value)
-    if isinstance(default, float):
-        return (isinstance(value, NUMBER) and not isinstance(value, bool)
-                and math.isfinite(value))
-    return type(value) is type(default) and not (type(value) is int and abs(value) > MAX_SIZE)
+        raise no_network(where, error) from error
 
 
 def _read_weights(path: Path, shapes: dict[str, tuple]) -> bytes:

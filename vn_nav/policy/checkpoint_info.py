@@ -15,12 +15,14 @@ from vn_nav.structured_file import read_json
 
 SEARCH = 'search'  # the architecture of `vn_nav.policy.search`
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
+POLICY, GOAL, SEE, COMPARE = ONNX_FILES = 'policy.onnx', 'goal.onnx', 'see.onnx', 'compare.onnx'
 PLACE = 'place.safetensors'  # of a policy that searches, where it was taught a place
 FORMAT = 2
 OWN = {'format', 'network', 'action_names', 'sha256'}  # keys that are not of INFO
 PLACE_CHECKSUM = 'place_sha256'  # a key that is not of INFO either: of a taught policy alone
 CHECKSUM = 'config_sha256'  # of everything else in the file; older checkpoints have none
 DECODINGS = ('sample', 'greedy')
+MOTION_NOISES = ('all', 'moves', 'none')  # of moves and turns, of moves alone, none
 REQUIRED = object()
 # What a checkpoint says besides its weights, and the defaults.
 INFO: dict[str, Any] = {
@@ -34,6 +36,7 @@ INFO: dict[str, Any] = {
     'objects': 1,  # in a place at a time
     'randomisation': 'none',  # of light, camera and base: a name, or a file's path
     'preset': '',  # see vn_nav.learning.presets
+    'motion_noise': 'all',  # of `MOTION_NOISES`
     'goals_per_room': 1,  # of each place
     'goal_variants': None,  # differently lit pictures of each goal; None: the randomisation's
     'stop_threshold': None,  # probability of arrival above which the policy declares its stop
@@ -62,7 +65,8 @@ TEXT, LIST, INTEGER, NUMBER = (str,), (list, tuple), (int,), (int, float)
 INFO_TYPES = {
     'world_version': Rule(TEXT), 'decoding': Rule(TEXT), 'task': Rule(TEXT),
     'randomisation': Rule(TEXT), 'preset': Rule(TEXT), 'command': Rule(TEXT),
-    'notes': Rule(TEXT), 'results': Rule((dict,)), 'label_names': Rule(LIST),
+    'motion_noise': Rule(TEXT), 'notes': Rule(TEXT), 'results': Rule((dict,)),
+    'label_names': Rule(LIST),
     'data': Rule(TEXT), 'losses': Rule(LIST),
     'scenes': Rule(LIST), 'simulator': Rule(TEXT), 'objects': Rule(INTEGER, 0, 1000),
     'goals_per_room': Rule(INTEGER, 1, 1000), 'goal_variants': Rule(INTEGER, 1, 1000),
@@ -72,8 +76,13 @@ INFO_TYPES = {
 }
 
 
-def read_config(folder: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_config(folder: str | Path, beside: tuple[str, ...] = (WEIGHTS, *ONNX_FILES)
+                ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read and check `config.json`; the network and the weights are not looked at.
+
+    Args:
+        folder: of the checkpoint, or of its export.
+        beside: other files, one of which has to be there.
 
     Returns:
         All of it, and of it the keys of `INFO`.
@@ -83,10 +92,11 @@ def read_config(folder: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
             of a wrong type or size.
     """
     folder = Path(folder)
-    for name in (CONFIG, WEIGHTS):
-        if not (folder / name).is_file():
-            raise UserError(f'a checkpoint is a folder with {CONFIG} and {WEIGHTS}',
-                            str(folder / name), 'pass such a folder; shipped ones are in models/')
+    for names in ((CONFIG,), beside):
+        if not any((folder / name).is_file() for name in names):
+            raise UserError(f'a checkpoint is a folder with {CONFIG} and {beside[0]}',
+                            str(folder / names[0]),
+                            'pass such a folder; shipped ones are in models/')
     where = str(folder / CONFIG)
     config = read_json(where, CONFIG, 'get the checkpoint again')
     if config.get('format') != FORMAT:
@@ -134,8 +144,9 @@ def check_info(info: dict, where: str) -> dict:
     for key, value in full.items():
         if value is not None or INFO[key] is not None:
             _check_entry(key, value, where)
-    if full['decoding'] not in DECODINGS:
-        raise UserError('decoding is sample or greedy', full['decoding'], f'correct {where}')
+    for key, values in (('decoding', DECODINGS), ('motion_noise', MOTION_NOISES)):
+        if full[key] not in values:
+            raise UserError(f'{key} is {" or ".join(values)}', full[key], f'correct {where}')
     return full
 
 

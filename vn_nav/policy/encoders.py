@@ -17,6 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from vn_nav.policy.pooling import averages
+
 LARGE_LAYOUT_PX = 128  # pixels: from here on the thesis network has its layout for 174 x 174
 
 
@@ -177,6 +179,16 @@ def channels_last(module: nn.Module) -> None:
     """Let the weights of convolutions lie in memory as the pictures do."""
     # torch's own annotations of `to` lack the argument.
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def averaged(maps: Tensor, rows: int, columns: int) -> Tensor:
+    """Maps [N,C,h,w] averaged to [N,C,rows,columns], as `F.adaptive_avg_pool2d`.
+
+    By products, which ONNX has for any sizes.
+    """
+    down, across = (torch.from_numpy(averages(side, parts)).to(maps) for side, parts in zip(
+        maps.shape[2:], (rows, columns), strict=True))
+    return down @ maps @ across.T
 
 
 def directions(maps: Tensor) -> Tensor:

@@ -1,4 +1,15 @@
-"""A checkpoint as ONNX, for robots without PyTorch: `policy.onnx`, and `goal.onnx` with it.
+"""A checkpoint as ONNX, for robots without PyTorch. policy_node takes the folder as `checkpoint`.
+
+The folder holds the checkpoint's `config.json`, its taught place where it has one, and models. A
+policy that searches has three, which see; its planner decides, with NumPy and Numba. N is free:
+
+| | inputs | outputs, float32 |
+|---|---|---|
+| `goal.onnx` | `picture` uint8 [N,3,S,S] | `goal` [N,K]: what is kept of a goal |
+| `see.onnx` | the same | `features` [N,2,C,h,w], `places` [N,P,C], `ranges` [N,32,24] |
+| `compare.onnx` | `features`, `goal` | the fields of `vn_nav.policy.search.look.Recognition` |
+
+Of another policy there are `policy.onnx`, and `goal.onnx` with it.
 
 `goal.onnx` runs once for each goal: `picture` uint8 [1,3,S,S] -> `goal`. A policy that looks at no
 goal has none. `policy.onnx` is one decision of one robot. It has those of these inputs and outputs
@@ -26,7 +37,7 @@ metadata name one (`action_filter`), the figures of the checkpoint were measured
 what `vn_nav.policy.action_filter.BlockedActionFilter` says, which needs NumPy alone, to the
 logits, once for each decision (an example is in the exported `README.md`).
 
-The metadata of both files are strings: `action_names` (JSON, in the order of the logits), `size`
+The metadata of all files are strings: `action_names` (JSON, in the order of the logits), `size`
 (S), `camera_fov_deg`, `camera_height` [m], `decoding` (sample or greedy), `stop_threshold`
 (probability of arrival; empty: none), `action_filter` (none or blocked_actions), `moves` (JSON:
 dx, dy [m], dyaw [rad] of each action, if the policy knows them), `world_version`,
@@ -40,6 +51,7 @@ import io
 import json
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -48,12 +60,15 @@ from vn_nav.errors import UserError
 from vn_nav.files import write_file
 from vn_nav.observation import Observation
 from vn_nav.policy.action_filter import NONE
-from vn_nav.policy.checkpoint import LoadedCheckpoint
+from vn_nav.policy.checkpoint import LoadedCheckpoint, config_file, taught_bytes
+from vn_nav.policy.checkpoint_info import COMPARE, CONFIG, GOAL, ONNX_FILES, PLACE, POLICY, SEE
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Policy
-from vn_nav.policy.network_config import SEARCH
+from vn_nav.policy.search.look import Recognition
+from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.torch_eyes import seen_by
 
-POLICY, GOAL, README = 'policy.onnx', 'goal.onnx', 'README.md'
+README = 'README.md'
 OPSET = 17
 
 
@@ -65,29 +80,33 @@ def export_onnx(checkpoint: LoadedCheckpoint, folder: str | Path) -> list[Path]:
         folder: where; made if need be. Files of an earlier export are replaced.
 
     Returns:
-        The models: `policy.onnx`, and `goal.onnx` if the policy looks at goals. `README.md` says
-        how they are used.
+        The models, see above. `README.md` says how they are used.
 
     Raises:
-        UserError: a policy that is more than a network; the package onnx is not installed, or the
-            folder cannot be written.
+        UserError: the package onnx is not installed, or the folder cannot be written.
     """
-    if checkpoint.config.architecture == SEARCH:
-        raise UserError('an export holds whole decisions as one network',
-                        'a policy of the architecture search: a planner on its map decides',
-                        'run it with vn_nav, or export a policy of another preset')
-    step, folder = _Step(checkpoint.network), Path(folder)
-    models: dict[str, tuple[nn.Module, dict[str, Tensor], list[str]]] = {
-        POLICY: (step, step.example, step.output_names)}
-    if 'goal' in step.example:
-        models[GOAL] = (_Goal(checkpoint.network), {'picture': step.example['image']}, ['goal'])
-    files = {name: _export(*model, checkpoint) for name, model in models.items()}
+    folder, network = Path(folder), checkpoint.network
+    if isinstance(network, SearchPolicy):
+        models, about = _eyes(network), _SEARCH_README.format(**checkpoint.info)
+    else:
+        step = _Step(network)
+        models = {POLICY: _Graph(step, step.example, step.output_names)}
+        if 'goal' in step.example:
+            models[GOAL] = _Graph(_Goal(network), {'picture': step.example['image']}, ['goal'])
+        about = _readme(step, checkpoint)
+    files = {name: _export(model, checkpoint) for name, model in models.items()}
+    place = taught_bytes(network)
+    info = {name: value for name, value in checkpoint.info.items() if name != 'sha256'}
+    _, config = config_file(network, info, checkpoint.info['sha256'], place)
+    others = {README: about.encode(), CONFIG: config.encode()}
+    if place is not None:
+        others[PLACE] = place
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / GOAL).unlink(missing_ok=True)  # of another policy, which looked at goals
-        for name, data in files.items():
+        for name in (*ONNX_FILES, PLACE):
+            (folder / name).unlink(missing_ok=True)  # of another policy
+        for name, data in (files | others).items():
             write_file(folder / name, data)
-        write_file(folder / README, _readme(step, checkpoint).encode())
     except OSError as error:
         raise UserError('an export is written to a folder',
                         f'{error.filename or folder}: {error.strerror}',
@@ -95,8 +114,17 @@ def export_onnx(checkpoint: LoadedCheckpoint, folder: str | Path) -> list[Path]:
     return [folder / name for name in files]
 
 
+class _Graph(NamedTuple):
+    """A model to write."""
+
+    module: nn.Module
+    example: dict[str, Tensor]  # inputs by name
+    outputs: list[str]
+    free: bool = False  # the number of pictures
+
+
 class _Goal(nn.Module):
-    """What a policy keeps of a goal picture."""
+    """What a policy keeps of goal pictures."""
 
     def __init__(self, network: Policy):
         super().__init__()
@@ -104,6 +132,40 @@ class _Goal(nn.Module):
 
     def forward(self, picture: Tensor) -> Tensor:
         return self.network.encode_goals(picture)
+
+
+class _See(nn.Module):
+    """What it sees in pictures alone."""
+
+    def __init__(self, network: SearchPolicy):
+        super().__init__()
+        self.network = network
+
+    def forward(self, picture: Tensor) -> tuple[Tensor, ...]:
+        return *seen_by(self.network, picture), self.network.see_ranges(picture)
+
+
+class _Compare(nn.Module):
+    """Where goals stand from pictures."""
+
+    def __init__(self, network: SearchPolicy):
+        super().__init__()
+        self.network = network
+
+    def forward(self, features: Tensor, goal: Tensor) -> tuple[Tensor, ...]:
+        return tuple(self.network.compare(features, goal))
+
+
+def _eyes(network: SearchPolicy) -> dict[str, _Graph]:
+    """The models of a policy that searches."""
+    side = network.config.size
+    pictures = torch.zeros(2, 3, side, side, dtype=torch.uint8)
+    with torch.no_grad():
+        pair = {'features': network.see(pictures), 'goal': network.encode_goals(pictures)}
+    return {GOAL: _Graph(_Goal(network), {'picture': pictures}, ['goal'], True),
+            SEE: _Graph(_See(network), {'picture': pictures}, ['features', 'places', 'ranges'],
+                        True),
+            COMPARE: _Graph(_Compare(network), pair, list(Recognition._fields), True)}
 
 
 class _Step(nn.Module):
@@ -150,23 +212,26 @@ class _Step(nn.Module):
         return *said, *(getattr(state, name) for name in self.memory)
 
 
-def _export(module: nn.Module, example: dict[str, Tensor], outputs: list[str],
-            checkpoint: LoadedCheckpoint) -> bytes:
+def _export(graph: _Graph, checkpoint: LoadedCheckpoint) -> bytes:
     try:
         import onnx
     except ImportError as error:
         raise UserError('an export needs the package onnx', str(error),
                         'pip install "vn_nav[onnx]"') from error
-    buffer = io.BytesIO()
+    buffer, names = io.BytesIO(), [*graph.example, *graph.outputs]
     with warnings.catch_warnings(), torch.no_grad():
         # Tracing knows shapes as numbers, and says so; they are fixed here. And torch recommends
         # its newer exporter, which needs more packages.
         warnings.simplefilter('ignore', torch.jit.TracerWarning)
         warnings.simplefilter('ignore', DeprecationWarning)
+        # The pictures' mirror images.
+        warnings.filterwarnings('ignore', 'Constant folding', UserWarning)
         # torch's annotations know only the new exporter, which takes no open file.
-        torch.onnx.export(module.eval(), tuple(example.values()),
+        torch.onnx.export(graph.module.eval(), tuple(graph.example.values()),
                           buffer, dynamo=False,  # type: ignore[arg-type]
-                          opset_version=OPSET, input_names=list(example), output_names=outputs)
+                          opset_version=OPSET, input_names=list(graph.example),
+                          output_names=graph.outputs,
+                          dynamic_axes={name: {0: 'N'} for name in names} if graph.free else None)
     model = onnx.load_from_string(buffer.getvalue())
     info, config = checkpoint.info, checkpoint.config
     facts = {
@@ -187,7 +252,26 @@ def _signature(values) -> str:
     import onnx
     return json.dumps({value.name: [
         onnx.TensorProto.DataType.Name(value.type.tensor_type.elem_type).lower(),
-        [part.dim_value for part in value.type.tensor_type.shape.dim]] for value in values})
+        [part.dim_value or part.dim_param for part in value.type.tensor_type.shape.dim]]
+        for value in values})
+
+
+_SEARCH_README = """# A visual navigation policy as ONNX
+
+Exported by vn_nav from weights with SHA-256 `{sha256}`. It searches: `see.onnx`, `goal.onnx` and
+`compare.onnx` see, a planner of vn_nav decides. `vn_nav.policy.export` says what they take and
+give, `config.json` what pictures and actions are.
+
+```python
+from vn_nav.policy.runtime import PolicyRuntime  # NumPy, OpenCV, Numba, ONNX Runtime
+
+policy = PolicyRuntime('.')
+policy.set_goal(goal)  # uint8 [3,S,S] RGB, as policy.prepare makes it
+action = policy.action_names[policy.act(picture, odometry)]
+```
+
+On a robot: `ros2 run vn_nav policy_node --ros-args -p checkpoint:=THIS_FOLDER`.
+"""
 
 
 def _readme(step: _Step, checkpoint: LoadedCheckpoint) -> str:

@@ -95,16 +95,28 @@ def _describe(network: dict) -> str:
 
 
 def _results_table(results: dict) -> list[str]:
-    """One row for each nested mapping, its figures as columns; other values as a list."""
+    """One row for each nested mapping, its figures as columns; other values as a list.
+
+    Rows that have no figure in common stand in tables of their own.
+    """
     rows = {name: row for name, row in results.items() if isinstance(row, dict)}
-    lines = []
-    if rows:
-        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
-        lines += ['| | ' + ' | '.join(key.replace('_', ' ') for key in columns) + ' |',
+    tables: list[dict[str, dict]] = []
+    for name, row in rows.items():
+        for own in tables:
+            if not row or any(row.keys() & other.keys() for other in own.values()):
+                own[name] = row
+                break
+        else:
+            tables.append({name: row})
+    lines: list[str] = []
+    for own in tables:
+        columns = list(dict.fromkeys(key for row in own.values() for key in row))
+        lines += [*([''] if lines else []),
+                  '| | ' + ' | '.join(key.replace('_', ' ') for key in columns) + ' |',
                   '|---' * (len(columns) + 1) + '|']
         lines += [f'| {name.replace("_", " ")} | '
                   + ' | '.join(_figure(row.get(key, '')) for key in columns) + ' |'
-                  for name, row in rows.items()]
+                  for name, row in own.items()]
     single = [f'- {name.replace("_", " ")}: {_figure(value)}' for name, value in results.items()
               if name not in rows]
     return lines + ([''] if rows and single else []) + single

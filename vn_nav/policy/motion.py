@@ -1,7 +1,9 @@
 """From a discrete action to velocities: the only place where an action becomes a Twist.
 
 The profile is a trapezoid under the robot's limits. It is closed on odometry where there is any,
-else timed. The last velocity is chosen so that it lands on the target within one period.
+else timed. The last velocity is chosen so that it lands on the target within one period. A real
+base hears commands late and rolls on: how far is learned from where its actions come to rest, and
+each action ends so much earlier (iterative learning control: Arimoto et al., 1984).
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ from vn_nav.robot import AXES, RobotSpec
 
 BLOCKED_FACTOR = 1.5  # an action without progress ends after this multiple of its duration
 LONGEST_FACTOR = 3.0  # and any action after this one
+LEARNING = 0.5  # share of an overshoot by which the next action of its axis ends earlier
+MOST_ROLL = 0.7  # of an action may be left to rolling on
 
 
 class ActionExecutor:
@@ -24,11 +28,17 @@ class ActionExecutor:
         tolerance: distance [m] (and, times 2, angle [rad]) at which an action is done.
         creep: least speed [m/s, rad/s] before the tolerance is reached; a real base does not turn
             its wheels for less.
+        learns: whether it learns how far the base rolls on; needs odometry.
+
+    Attributes:
+        roll: by axis, how far the base moves after an action's end [m or rad].
     """
 
-    def __init__(self, robot: RobotSpec, *, tolerance: float, creep: float):
-        self.robot, self.tolerance, self.creep = robot, tolerance, creep
+    def __init__(self, robot: RobotSpec, *, tolerance: float, creep: float, learns: bool = False):
+        self.robot, self.tolerance, self.creep, self.learns = robot, tolerance, creep, learns
         self.action: int | None = None
+        self.roll = dict.fromkeys(AXES, 0.0)
+        self._completed = False  # the last action came to its end
 
     def begin(self, action: int, odometry: np.ndarray | None) -> None:
         """Start an action from rest.
@@ -37,6 +47,9 @@ class ActionExecutor:
             action: index into the robot's table.
             odometry: [3] x, y [m], yaw [rad] at its start; None: timed.
         """
+        if self.learns and self._completed and odometry is not None:
+            self._learn(odometry)
+        self._completed = False
         self.action = action
         entry = self.robot.actions[action]
         self._axis, self._sign = entry.axis, math.copysign(1.0, entry.size)
@@ -47,6 +60,10 @@ class ActionExecutor:
         self._turned, self._last_yaw = 0.0, None if odometry is None else odometry[2]
         self._speed = self._elapsed = 0.0
         self._nominal = self.robot.nominal_duration(action)
+
+    def abandon(self) -> None:
+        """Forget the action: where the robot is next says nothing of it."""
+        self.action, self._completed = None, False
 
     def velocity(self, dt: float, odometry: np.ndarray | None) -> tuple[np.ndarray, bool]:
         """The velocity for the next period.
@@ -60,12 +77,14 @@ class ActionExecutor:
         """
         if self._start is not None and odometry is not None:
             self._measure(self._start, odometry)
-        remaining = self._size - self._covered
-        tolerance = self.tolerance * (1.0 if self._axis in ('dx', 'dy') else 2.0)
+        remaining = self._size - self._covered - (
+            0.0 if self._start is None else min(self.roll[self._axis], MOST_ROLL * self._size))
+        tolerance = self._tolerance()
         stuck = (self._elapsed >= BLOCKED_FACTOR * self._nominal
                  and self._covered - self._before < 0.1 * self._speed * dt)
         if remaining <= tolerance or stuck or self._elapsed >= LONGEST_FACTOR * self._nominal:
             self.action = None
+            self._completed = remaining <= tolerance
             return np.zeros(4), True
         acceleration = self.robot.acceleration(self._axis)
         # The fastest speed from which n periods of full braking end exactly at the target:
@@ -81,6 +100,19 @@ class ActionExecutor:
         velocity = np.zeros(4)
         velocity[AXES.index(self._axis)] = self._sign * speed
         return velocity, False
+
+    def _tolerance(self) -> float:
+        return self.tolerance * (1.0 if self._axis in ('dx', 'dy') else 2.0)
+
+    def _learn(self, odometry: np.ndarray) -> None:
+        """From where the last action's end has left the robot, which is at rest now."""
+        if self._start is None:
+            return
+        self._measure(self._start, odometry)
+        over = self._covered - self._size
+        # Less is noise; more is no rolling: the pose was set, or somebody else drove.
+        if self._tolerance() < abs(over) < self._size:
+            self.roll[self._axis] = max(0.0, self.roll[self._axis] + LEARNING * over)
 
     def _measure(self, start: np.ndarray, odometry: np.ndarray) -> None:
         """Displacement along the action's axis since odometry said `start`."""

@@ -9,6 +9,7 @@ States:
     hold      enabled, zero velocity until the cause is gone by itself.
     arrived   enabled, zero velocity: the policy has declared that it is there; until another goal
               comes, or `enable`.
+    failed    enabled, zero velocity: the goal was given up (see `goal_record`); likewise.
     stopped   latched: zero for a second, then silent, until `reset` and `enable`.
 """
 
@@ -16,10 +17,13 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import math
 
 import numpy as np
 
+from vn_nav.arrival import wrap_angle
 from vn_nav.policy.frame_gate import FrameGate, shorten
+from vn_nav.policy.goal_record import Code, GoalLimits, GoalRecord, Status
 from vn_nav.policy.motion import ActionExecutor, cruise, ramp
 from vn_nav.robot import RobotSpec
 
@@ -34,10 +38,14 @@ class State(enum.Enum):
     RUNNING = 'running'
     HOLD = 'hold'
     ARRIVED = 'arrived'
+    FAILED = 'failed'
     STOPPED = 'stopped'
 
 
-ENABLED = (State.RUNNING, State.HOLD, State.ARRIVED)
+ENABLED = (State.RUNNING, State.HOLD, State.ARRIVED, State.FAILED)
+AT_THE_END = (State.ARRIVED, State.FAILED)
+# Faster by odometry, a base still rolls; some that stand jitter, and are not waited for.
+ROLLS_M_PER_S, ROLLS_RAD_PER_S, LONGEST_ROLL_S = 0.02, 0.03, 2.0
 
 
 class Phase(enum.Enum):
@@ -68,13 +76,20 @@ class Navigator:
         limits: see `Limits`.
         continuous: decide at every frame and hold the action's velocity in between.
         exact: lock-step simulation: actions end within micrometres and frames carry exact stamps.
+        goal_limits: when a goal is given up.
+
+    Attributes:
+        goal: the newest goal, and how it ended.
+        goal_limits: when that one is given up; usual_limits: as given.
     """
 
     def __init__(self, robot: RobotSpec, limits: Limits, *, continuous: bool = False,
-                 exact: bool = False):
+                 exact: bool = False, goal_limits: GoalLimits | None = None):
+        self.goal_limits = self.usual_limits = goal_limits or GoalLimits()
+        self.goal = GoalRecord()
         self.robot, self.limits, self.continuous, self.exact = robot, limits, continuous, exact
         self.executor = (ActionExecutor(robot, tolerance=1e-6, creep=0.0) if exact
-                         else ActionExecutor(robot, tolerance=0.004, creep=0.02))
+                         else ActionExecutor(robot, tolerance=0.004, creep=0.02, learns=True))
         self.state, self.reason = State.IDLE, 'not enabled'
         self.phase = Phase.LOOK
         self.goal_ready = False
@@ -85,10 +100,14 @@ class Navigator:
         self.gate = FrameGate(limits.max_frame_age, limits.max_frame_ahead)
         self.epoch = 0  # grows when time was set: what the policy remembers is of another time
         self.goal_refusal = ''  # why the newest goal picture was unusable
+        self._failure = ''  # why the goal was given up
+        self._now = 0.0  # steady time, as last heard
         self._target = np.zeros(4)
         self._stopped_from: float | None = None  # steady time of a stop's first zero
         self._settles = False  # a motion was cut off: a picture at rest is still to come
         self._idle_from: float | None = -np.inf  # steady time of leaving motion; None: just now
+        self._rolled: np.ndarray | None = None  # odometry in the last step at rest
+        self._rolls_until = -np.inf  # stamp
         self._healthy_since: float | None = None
         self._last_frame: float | None = None  # steady time at which the newest good frame came
         self._look_after = -np.inf  # stamp that the next decision's frame must exceed
@@ -138,27 +157,43 @@ class Navigator:
         self._bad_frames += 1
         self._healthy_since = None
         if self._bad_frames >= 3 and self.state in ENABLED:
-            self.stop(f'three bad frames in a row: {self.gate.last}', now)
+            self.stop(f'three bad frames in a row: {self.gate.last}', now, Code.CAMERA_LOST)
 
     # Goals.
 
-    def new_goal(self) -> None:
-        """Another goal picture came: a new episode, which begins with standing still."""
-        self.goal_ready, self.arrival, self.goal_refusal = False, None, ''
+    def new_goal(self, limits: GoalLimits | None = None) -> None:
+        """Another goal picture came: a new episode, which begins with standing still.
+
+        Args:
+            limits: of this goal; None: the usual ones.
+        """
+        self.goal_limits = limits or self.usual_limits
+        self.goal.end(Status.CANCELLED, self._now, message='another goal came')
+        self.goal_ready, self.arrival, self.goal_refusal, self._failure = False, None, '', ''
         self._abandon()
-        if self.state in (State.RUNNING, State.ARRIVED):
+        if self.state in (State.RUNNING, *AT_THE_END):
             self.state, self.reason = State.HOLD, 'goal changed'
 
-    def accept_goal(self, stamp: float) -> None:
-        """The policy knows the goal. Frames up to `stamp` belong to the episode before."""
+    def accept_goal(self, stamp: float, again: bool = False) -> None:
+        """The policy knows the goal. Frames up to `stamp` belong to the episode before.
+
+        Args:
+            stamp: of the goal [s].
+            again: it is the same goal as before, cut for what the camera says of itself now.
+        """
         self.goal_ready, self.decisions = True, 0
+        if not again or self.goal.code is Code.GOAL_REFUSED:
+            self.goal.accept()
+            if self.state in ENABLED:
+                self.goal.activate(self._now)
         self._look_after = max(self._look_after, stamp)
 
     def refuse_goal(self, why: str) -> None:
         """The goal picture was unusable: as if there were none."""
         self.goal_ready, self.goal_refusal = False, shorten(why)
+        self.goal.refuse(self.goal_refusal)
         self._abandon()
-        if self.state in (State.RUNNING, State.HOLD, State.ARRIVED):
+        if self.state in ENABLED:
             self.state, self.reason = State.HOLD, f'goal refused: {self.goal_refusal}'
 
     # Commands of people.
@@ -182,27 +217,42 @@ class Navigator:
             missing.append(f'frames are healthy for less than {ARMING_SECONDS:.0f} s: try again')
         if missing:
             return False, '; '.join(missing)
-        self.arrival = None
-        if self.state in (State.IDLE, State.ARRIVED):
+        self._now, self.arrival = now, None
+        if self._failure:
+            self._failure, self.decisions = '', 0  # it has its budget once more
+        if self.state in (State.IDLE, *AT_THE_END):
             self._abandon()
             self.state, self.reason = State.RUNNING, ''
+        self.goal.activate(now)
         return True, 'enabled'
 
     def disable(self) -> None:
         """Zero at once, repeated for `STOP_SECONDS`, then silence; not latched."""
+        self.goal.end(Status.CANCELLED, self._now, message='disabled')
         if self.state is not State.STOPPED:
             self._idle('disabled')
 
-    def stop(self, reason: str, now: float) -> None:
-        """Zero at once, latched."""
+    def give_up(self, code: Code, why: str) -> None:
+        """The goal has failed: zero velocity at once, until another one comes, or `enable`."""
+        if self.state in ENABLED and self.goal.status is Status.ACTIVE:
+            self.goal.end(Status.FAILED, self._now, code, shorten(why))
+            self._failure = self.goal.message
+            self._abandon()
+            self._go_on()
+
+    def stop(self, reason: str, now: float, code: Code = Code.STOPPED) -> None:
+        """Zero at once, latched; the goal has failed."""
+        self._now = now
+        self.goal.end(Status.FAILED, now, code, shorten(reason))
         if self.state is not State.STOPPED:
             self.state, self.reason, self._stopped_from = State.STOPPED, shorten(reason), None
-        self.arrival = None
+        self.arrival, self._failure = None, ''
         self._abandon()
 
     def reset(self) -> None:
         """Clear a latched stop; never enables."""
         self._bad_frames = self._late_inferences = 0
+        self.goal.end(Status.CANCELLED, self._now, message='reset')
         self._idle('not enabled')
 
     def _idle(self, reason: str) -> None:
@@ -211,12 +261,14 @@ class Navigator:
             self._idle_from = None  # a command may be in force: the next step takes it back
         elif self.state is State.STOPPED:
             self._idle_from = self._stopped_from  # its second of zeros goes on
-        self.state, self.reason, self.arrival = State.IDLE, reason, None
+        self.goal.end(Status.FAILED, self._now, Code.STOPPED, reason)
+        self.state, self.reason, self.arrival, self._failure = State.IDLE, reason, None, ''
 
     def _abandon(self) -> None:
         """Forget the action and the decision under way; velocity zero."""
         self.cut_off += self.phase is Phase.MOVE or self._pending_action is not None
-        self.phase, self.executor.action = Phase.LOOK, None
+        self.phase = Phase.LOOK
+        self.executor.abandon()
         self._settles |= bool(self.velocity.any())
         self._ticket += 1
         self._inferring_since = self._pending_action = None
@@ -226,6 +278,13 @@ class Navigator:
 
     def wants(self, stamp: float) -> bool:
         """Whether a decision from a frame with this stamp is wanted."""
+        wanted = self._wants(stamp)
+        if wanted and 0 < self.goal_limits.max_decisions <= self.decisions:
+            self.give_up(Code.BUDGET, f'{self.decisions} decisions are used up')
+            return False
+        return wanted
+
+    def _wants(self, stamp: float) -> bool:
         return (self.state is State.RUNNING and self.goal_ready
                 and self._inferring_since is None and stamp > self._look_after
                 and (self.phase is Phase.LOOK or self.continuous)
@@ -258,6 +317,7 @@ class Navigator:
             self.decisions += 1
             self._abandon()
             self.arrival = probability
+            self.goal.end(Status.SUCCEEDED, now)
             self._go_on()
 
     def _in_time(self, ticket: int, now: float) -> bool:
@@ -272,8 +332,10 @@ class Navigator:
         return True
 
     def _go_on(self) -> None:
-        """With nothing in the way: drive, or stand where the policy has arrived."""
-        if self.arrival is None:
+        """With nothing in the way: drive, or stand where the goal has ended."""
+        if self._failure:
+            self.state, self.reason = State.FAILED, self._failure
+        elif self.arrival is None:
             self.state, self.reason = State.RUNNING, ''
         else:
             self.state, self.reason = State.ARRIVED, f'p = {self.arrival:.2f}'
@@ -318,12 +380,13 @@ class Navigator:
             stamp: present time in the frames' clock [s].
             odometry_lost: there was odometry, and it is stale: no motion without it.
         """
+        self._now = now
         if self._settles:  # what moved gets a zero command now
             self._settles = False
             if not (self.continuous or self.exact):
                 self._look_after = max(self._look_after, stamp + self.limits.settle_time)
         if odometry_lost and self.state is State.RUNNING and self.velocity.any():
-            self.stop('odometry fell silent in motion', now)
+            self.stop('odometry fell silent in motion', now, Code.ODOMETRY_LOST)
         if self.state is State.STOPPED:
             if self._stopped_from is None:
                 self._stopped_from = now
@@ -333,6 +396,8 @@ class Navigator:
                 self._idle_from = now
             return np.zeros(4) if now - self._idle_from < STOP_SECONDS else None
         self._watch(now, odometry_lost)
+        if 0 < self.goal_limits.time_allowance < self.goal.seconds(now):
+            self.give_up(Code.BUDGET, f'{self.goal_limits.time_allowance:g} s are over')
         if self.state is not State.RUNNING:
             return np.zeros(4)
         if self._inferring_since is not None and (
@@ -345,7 +410,8 @@ class Navigator:
         """Silence of camera and odometry, and holds whose cause is gone."""
         silence = np.inf if self._last_frame is None else now - self._last_frame
         if silence > self.limits.frame_stop_timeout:
-            self.stop(f'no camera frame for {self.limits.frame_stop_timeout} s', now)
+            self.stop(f'no camera frame for {self.limits.frame_stop_timeout} s', now,
+                      Code.CAMERA_LOST)
         elif silence > self.limits.frame_timeout:
             if self.state is State.RUNNING:
                 self._abandon()
@@ -359,6 +425,7 @@ class Navigator:
     def _stop_and_go(self, dt: float, odometry: np.ndarray | None, stamp: float) -> np.ndarray:
         if self.phase is Phase.LOOK:
             if self._pending_action is None:
+                self._wait_for_rest(dt, odometry, stamp)
                 return np.zeros(4)
             self.executor.begin(self._pending_action, odometry)
             self._pending_action = None
@@ -368,7 +435,18 @@ class Navigator:
         if over:
             self.phase = Phase.LOOK
             self._look_after = stamp + self.limits.settle_time
+            self._rolled, self._rolls_until = odometry, stamp + LONGEST_ROLL_S
         return self.velocity
+
+    def _wait_for_rest(self, dt: float, odometry: np.ndarray | None, stamp: float) -> None:
+        """A base that rolls on by odometry is not at rest, whatever the time since its command."""
+        if self.exact or odometry is None or self._rolled is None or stamp > self._rolls_until:
+            return
+        step = odometry - self._rolled
+        self._rolled = odometry
+        if (math.hypot(step[0], step[1]) > ROLLS_M_PER_S * dt
+                or abs(wrap_angle(step[2])) > ROLLS_RAD_PER_S * dt):
+            self._look_after = max(self._look_after, stamp + self.limits.settle_time)
 
     def _cruise(self, dt: float) -> np.ndarray:
         if self._pending_action is not None:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import reprlib
 
 from vn_nav.errors import UserError
 from vn_nav.labels import CLASSES, MAX_CLASSES
 from vn_nav.policy.action_filter import BLOCKED_ACTIONS, FILTERS, NONE
-from vn_nav.policy.checkpoint_info import SEARCH
-from vn_nav.policy.zhu import FROZEN
+from vn_nav.policy.checkpoint_info import CONFIG, NUMBER, SEARCH
 
 ARCHITECTURES = ('fused', 'matching', 'thesis', 'unreal', 'icra2017', SEARCH)
 # Channels that each image head draws, and the width of its inner maps. The thesis says that depth
 # has "only" 32, so the segmentation heads are wider.
 IMAGE_HEADS = {'depth': (1, 32), 'segmentation': (3, 64), 'goal_segmentation': (3, 64),
                'reconstruction': (3, 32)}
+FROZEN = ('', 'resnet50', 'given')  # encoders of icra2017
+MAX_SIZE = 65_536  # of a layer, and whatever else a network counts
 HEADS = ('pixel_control', 'reward_prediction', *IMAGE_HEADS, 'goal_pose', 'arrival', 'distance')
 
 
@@ -52,7 +54,7 @@ class NetworkConfig:
     pixel_mean: float = 120.0
     pixel_std: float = 36.0
     # Of icra2017 alone.
-    frozen: str = ''  # encoder, of `vn_nav.policy.zhu.FROZEN`
+    frozen: str = ''  # encoder, of `FROZEN`
     scenes: int = 1  # that have layers of their own
     # Of search alone: what its map is drawn by. 0: not given.
     view: float = 0.0  # horizontal field of view of the camera [rad]
@@ -143,3 +145,55 @@ class NetworkConfig:
     @property
     def _usual_filter(self) -> str:
         return BLOCKED_ACTIONS if self.moves and self.architecture != SEARCH else NONE
+
+
+def read_network(config: dict, where: str) -> NetworkConfig:
+    """The network of a `config.json`.
+
+    Args:
+        config: all of it; where: its path, for people.
+
+    Raises:
+        UserError: unknown fields, or values of a wrong type or size.
+    """
+    names, given = config['action_names'], config['network']
+    if not (isinstance(names, list) and len(names) <= 256
+            and all(isinstance(name, str) for name in names)):
+        raise UserError('action_names is a list of at most 256 names',
+                        f'{where}: {reprlib.repr(names)}', 'get the checkpoint again')
+    if not isinstance(given, dict):
+        raise UserError(f'the network in {CONFIG} is a mapping', f'{where}: {reprlib.repr(given)}',
+                        'get the checkpoint again')
+    fields = {field.name: field.default for field in dataclasses.fields(NetworkConfig)
+              if field.name != 'actions'}
+    for name, value in given.items():
+        if name not in fields:
+            raise UserError(f'the network in {CONFIG} has only the fields {", ".join(fields)}',
+                            f'{where}: {name}', 'use the version of vn_nav that wrote it, or '
+                            'train again')
+        if not _fits(value, fields[name]):
+            raise UserError(f'{name} of the network in {CONFIG} is of the type and '
+                            f'size of {fields[name]!r}', f'{where}: {reprlib.repr(value)}',
+                            'get the checkpoint again')
+    try:
+        return NetworkConfig(actions=tuple(names), **given)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise no_network(where, error) from error
+
+
+def no_network(where: str, error: Exception) -> UserError:
+    """What is said of a configuration that no network can be built from."""
+    return UserError(f'the network in {CONFIG} can be built',
+                     f'{where}: {" ".join(str(error).split())[:200]}', 'get the checkpoint again')
+
+
+def _fits(value: object, default: object) -> bool:
+    """Whether a value out of JSON has the type of a field of `NetworkConfig`."""
+    if isinstance(default, tuple):
+        return isinstance(value, list) and all(
+            isinstance(part, (str, int)) or (isinstance(part, list) and all(
+                _fits(number, 0.0) for number in part)) for part in value)
+    if isinstance(default, float):
+        return (isinstance(value, NUMBER) and not isinstance(value, bool)
+                and math.isfinite(value))
+    return type(value) is type(default) and not (type(value) is int and abs(value) > MAX_SIZE)

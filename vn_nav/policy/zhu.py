@@ -21,7 +21,6 @@ from vn_nav.errors import UserError
 from vn_nav.policy.encoders import add_goals, apply, orthogonal, uniform_by_fan_in
 from vn_nav.policy.resnet import ResNet50
 
-FROZEN = ('', 'resnet50', 'given')  # of `NetworkConfig.frozen`
 BATCH = 32  # pictures that pass the frozen encoder at a time: large ones need much memory
 
 

@@ -14,6 +14,7 @@ from vn_nav.report.page import COLOURS, LIGHT
 
 DASH = 6.0, 4.0  # pixels drawn and left out
 FONT = 'system-ui, sans-serif'
+LABEL_MARGIN = 0.3  # of a step, left and right of an axis of labels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +58,8 @@ Shape = Line | Text
 
 
 def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, title: str,
-          y_range: tuple[float, float], log: bool, marks: Sequence[float] = ()) -> list[Shape]:
+          y_range: tuple[float, float], log: bool, marks: Sequence[float] = (),
+          labels: Sequence[str] = ()) -> list[Shape]:
     """Axes and curves.
 
     Args:
@@ -67,10 +69,14 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
         y_range: lowest and highest value shown.
         log: logarithmic x.
         marks: values to draw a dashed line at.
+        labels: below x = 0, 1, 2, ... in place of numbers.
     """
     left, top, right, bottom = box
-    x0 = min(s.x[0] for s in series) if log else 0.0
-    x1 = max(s.x[-1] for s in series)
+    if labels:
+        x0, x1 = -LABEL_MARGIN, len(labels) - 1 + LABEL_MARGIN
+    else:
+        x0 = min(s.x[0] for s in series) if log else 0.0
+        x1 = max(s.x[-1] for s in series)
     scale = math.log10 if log else float
     span = (scale(x1) - scale(x0)) or 1.0
     y0, y1 = y_range
@@ -85,9 +91,11 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
     for y in ticks(y0, y1):
         shapes += [Line(np.array([[left, up(y)], [right, up(y)]]), 'line'),
                    Text(left - 8, up(y) + 4, short(y), 'end')]
-    for x in log_ticks(x0, x1) if log else ticks(x0, x1):
+    named = (list(enumerate(labels)) if labels else
+             [(x, short(x)) for x in (log_ticks(x0, x1) if log else ticks(x0, x1))])
+    for x, name in named:
         shapes += [Line(np.array([[across(x), bottom], [across(x), bottom + 5]]), 'soft'),
-                   Text(across(x), bottom + 19, short(x), 'middle')]
+                   Text(across(x), bottom + 19, name, 'middle')]
     shapes += [Line(np.array([[left, up(y)], [right, up(y)]]), 'soft', dashed=True)
                for y in marks if y0 < y < y1]
     shapes += [Line(np.array([[left, bottom], [right, bottom]]), 'soft'),

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from vn_nav import __version__
 from vn_nav.errors import UserError
@@ -49,7 +50,7 @@ def compare(paths: Sequence[Path], out: Path, *, metric: str = 'success',
         raise UserError(f'a chart has at most {CURVES} curves', len(groups),
                         'compare fewer at a time, or give seeds of one thing one label')
     result = summary(groups)
-    shapes, height = _chart(groups, metric, band, log)
+    shapes, height = chart(groups, metric, band, log)
     if kind == '.png':
         picture = cv2.cvtColor(to_picture(shapes, WIDTH, height), cv2.COLOR_RGB2BGR)
         write_file(out, cv2.imencode('.png', picture)[1].tobytes())
@@ -63,26 +64,41 @@ def compare(paths: Sequence[Path], out: Path, *, metric: str = 'success',
     _print(result, out)
 
 
-def _chart(groups: dict[str, list[Run]], metric: str, band: str, log: bool
-           ) -> tuple[list[Shape], float]:
+def chart(groups: dict[str, list[Run]], metric: str, band: str = 'range', log: bool = False,
+          levels: Mapping[str, float] | None = None) -> tuple[list[Shape], float]:
+    """Curves against frames and wall-clock, and the height of the chart [pixels]; `WIDTH` wide.
+
+    Args:
+        groups: runs by label.
+        metric, band, log: see `compare`.
+        levels: names and values of horizontal lines.
+    """
+    levels = levels or {}
+    flat = [(label, f'c{k}') for k, label in enumerate(levels, start=len(groups))]
     names = [(f'{label} ({len(runs)} run{"s" * (len(runs) > 1)})', f'c{k}')
              for k, (label, runs) in enumerate(groups.items())]
-    shapes, used = legend(names, PANELS[0][0], 12, WIDTH - 16)
+    shapes, used = legend([*names, *flat], PANELS[0][0], 12, WIDTH - 16)
     top = 12 + used + 14
     curves = {axis: [average(runs, axis, metric, band=band, log=log) for runs in groups.values()]
               for axis in AXES}
     if metric in SHARES:
         y_range = 0.0, 1.0
     else:
-        low = min(curve.low.min() for own in curves.values() for curve in own)
-        high = max(curve.high.max() for own in curves.values() for curve in own)
+        low = min(*(curve.low.min() for own in curves.values() for curve in own),
+                  *levels.values())
+        high = max(*(curve.high.max() for own in curves.values() for curve in own),
+                   *levels.values())
         edge = 0.05 * (high - low) or 1.0
         y_range = low - edge, high + edge
     for (axis, own), (left, right) in zip(curves.items(), PANELS, strict=True):
         series = [Series(name, colour, c.x, c.mean, c.low, c.high, c.full)
                   for (name, colour), c in zip(names, own, strict=True)]
-        shapes += panel((left, top, right, top + PLOT), series, title=AXES[axis],
-                        y_range=y_range, log=log,
+        ends = np.array([min(c.x[0] for c in own) if log else 0.0, max(c.x[-1] for c in own)])
+        for (name, colour), value in zip(flat, levels.values(), strict=True):
+            line = np.full(2, value)
+            series.append(Series(name, colour, ends, line, line, line, np.ones(2, bool)))
+        shapes += panel((left, top, right, top + PLOT), series,
+                        title=f'{metric} over {AXES[axis]}', y_range=y_range, log=log,
                         marks=THRESHOLDS if metric == 'success' else ())
     return shapes, top + PLOT + 56
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from vn_nav.errors import UserError
+from vn_nav.files import write_file
 
 METRICS = 'metrics.csv'
 NEEDED = ('frames', 'minutes', 'tau', 'success')
@@ -18,6 +20,7 @@ THRESHOLDS = (0.5, 0.9)  # of success
 FULL_TAU = 0.999  # a tau from here on is 1: starts as far from the goal as in the evaluation
 HOLD_SHARE = 0.1  # of a run: how long a success has to hold on average
 CURVE_POINTS = 240  # of a curve
+KEPT_ROWS = 400  # of a curve that stays
 SMOOTHING_SHARE = 0.02  # of the axis: width of the running mean
 SEED = re.compile(r'[-_](?:seed|s)\d+$')
 
@@ -148,23 +151,49 @@ def _smooth(x: np.ndarray, y: np.ndarray, grid: np.ndarray, width: float) -> np.
             / (right - left))
 
 
-def reached(run: Run, threshold: float) -> tuple[float, float] | None:
-    """Frames and minutes to a success at tau = 1; None: not in this run.
+def reached(run: Run, threshold: float, metric: str = 'success', *, falls: bool = False,
+            in_curriculum: bool = False) -> tuple[float, float] | None:
+    """Frames and minutes to a value of a metric; None: not in this run.
 
     A success inside the curriculum is none: its starts are nearer. Nor is one that does not hold:
     the episodes that end first, at the beginning of a training, are the successful ones. So a row
-    counts when the mean over the following tenth of the run is as high.
+    counts when the mean over the following tenth of the run is as good.
 
     Args:
         run: as read.
-        threshold: of the success, the trainer's mean over its last 200 episodes.
+        threshold: of the metric, the trainer's mean over its last 200 episodes.
+        metric: a column.
+        falls: less is better.
+        in_curriculum: count rows inside the curriculum as well.
     """
-    frames, success = run.columns['frames'], run.columns['success']
-    for k in np.nonzero((run.columns['tau'] >= FULL_TAU) & (success >= threshold))[0]:
+    frames, sign = run.columns['frames'], -1 if falls else 1
+    values = sign * run.columns[metric]
+    good = values >= sign * threshold
+    if not in_curriculum:
+        good &= run.columns['tau'] >= FULL_TAU
+    for k in np.nonzero(good)[0]:
         following = (frames >= frames[k]) & (frames <= frames[k] + HOLD_SHARE * frames[-1])
-        if np.nanmean(success[following]) >= threshold:
+        if np.nanmean(values[following]) >= sign * threshold:
             return float(frames[k]), float(run.columns['minutes'][k])
     return None
+
+
+def thin(folder: Path, target: Path) -> None:
+    """Write a run's curve into a folder that stays, with at most `KEPT_ROWS` rows.
+
+    Args:
+        folder: of the run.
+        target: gets metrics.csv, the last row included.
+    """
+    with open(folder / METRICS, newline='') as file:
+        rows = list(csv.DictReader(file))
+    every = max(1, -(-len(rows) // KEPT_ROWS))
+    kept = io.StringIO()
+    writer = csv.DictWriter(kept, rows[0].keys(), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows[::-every][::-1])
+    target.mkdir(parents=True, exist_ok=True)
+    write_file(target / METRICS, kept.getvalue().encode())
 
 
 def summary(groups: dict[str, list[Run]]) -> dict[str, dict]:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vn_nav.measured_ranges import least_ranges
+from vn_nav.depth_ranges import least_ranges
 
 
 def ranges_of_depth(depth: np.ndarray, cameras: np.ndarray, fov: np.ndarray, yaw: np.ndarray,

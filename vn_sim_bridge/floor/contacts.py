@@ -8,12 +8,11 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from vn_nav.robot import RobotSpec
+from vn_nav.robot import MAX_TILT, RobotSpec
 from vn_sim_bridge.floor.places import WalledPlace
 
 TRANSLATION_NOISE = 0.02  # m per decision, standard deviation along the movement (thesis, 5.6)
 ROTATION_NOISE = math.radians(2.0)  # rad per decision (thesis, 5.7)
-MAX_TILT = math.radians(60.0)  # rad, either way
 STEP = 0.01  # m, the path is checked at this spacing
 PRECISION = 1e-4  # m, to which a contact is located
 

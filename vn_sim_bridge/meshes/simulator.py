@@ -57,7 +57,7 @@ class MeshSimulator(DrawnSimulator):
         self.label_names = tuple(label_names)
         if not rooms:
             self.capabilities = dataclasses.replace(self.capabilities, rooms=False)
-        self._set_up(setup.randomisation, setup.objects)
+        self._set_up(setup.randomisation, setup.objects, setup.goal_randomisation)
         self._use()
         for index in sorted(set(self.place_index.tolist())):  # what is wrong is said now
             self.cache.get(index)

@@ -17,7 +17,7 @@ class BaseMotion:
     """Displacements of actions, as they are really driven.
 
     Args:
-        config: whether motion is noisy, and how smooth the floor is.
+        config: how noisy motion is, and how smooth the floor is.
         robot: the actions.
         exact_turns: of the simulator.
 
@@ -43,9 +43,9 @@ class BaseMotion:
         delta = self.deltas[actions]
         if self._config.noise:
             seeds, numbers, episodes = counters
-            delta = motion_noise(delta, self._sizes[actions], normal(
+            delta = motion_noise(delta, self._sizes[actions], self._config.noise * normal(
                 seeds, Stream.MOTION_NOISE, numbers, episodes, step),
-                exact_turns=self._exact_turns)
+                exact_turns=self._exact_turns or not self._config.turn_noise)
         if self._config.randomisation.slip:
             scale = draw_grip(self._config.randomisation, *counters, step) * scale
         delta = delta.copy()

@@ -111,7 +111,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
         self.action_names = self.robot.action_names
         self.declare_action = len(self.action_names) if config.stop == 'declared' else None
         self._base = BaseMotion(config, self.robot, exact_turns=self.simulator.exact_turns)
-        self._odometry = None if config.odometry == 'none' else EpisodeOdometry(config.odometry, n)
+        self._odometry = None if config.odometry == 'none' else EpisodeOdometry(
+            config.odometry, n, config.drift)
         self._ranges = None if config.ranges == 'picture' else EpisodeRanges(
             config.ranges, self.simulator, self.robot, config.size)
         self.scanner = None if self._ranges is None else self._ranges.scanner

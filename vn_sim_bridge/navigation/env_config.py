@@ -40,7 +40,8 @@ class EnvConfig:
     size: int = 84  # pixels
     actions: tuple[str, ...] = DRIVE_ACTIONS
     max_decisions: int = 300
-    noise: bool = True
+    noise: float = 1.0  # of motion, times its standard deviations; 0: none
+    turn_noise: bool = True  # of turns as well; the thesis has none in its 5.6
     progress_reward: float = 0.0  # per metre of geodesic progress
     collision_reward: float = 0.0  # per decision that touched something; a penalty is negative
     step_reward: float = 0.0  # per decision that does not reach the goal; a penalty is negative
@@ -53,12 +54,14 @@ class EnvConfig:
     objects: int = 1  # in a place at a time (object, collect)
     room_must_see: bool = False  # the room rule of House3D's code, see tasks.RoomGoal
     randomisation: Randomisation = Randomisation()
+    goal_randomisation: Randomisation | None = None  # of goal pictures; None: the same
     privileged: tuple[str, ...] = ()  # of PRIVILEGED
     stop: str = 'arrival'  # of STOPS: an episode ends on arrival, or when the robot says so
     goal_variants: int | None = None  # pictures of each goal; default: the randomisation's
     goal_seed: int = 0  # 0: the scenes' own goals, else other ones in the same scenes
     exploration_reward: float = 0.0  # per square of floor that is new to the episode, see SQUARE
     odometry: str = 'none'  # of ODOMETRIES: what the robots observe of their own motion
+    drift: float = 1.0  # of odometry that drifts, as of `odometry.drift_errors`
     ranges: str = 'picture'  # of RANGES: what a policy's map is given; 'picture': nothing
 
     def __post_init__(self):
@@ -79,6 +82,8 @@ class EnvConfig:
             (self.goal_seed >= 0, 'the seed of goals is not negative', self.goal_seed),
             (self.odometry in ODOMETRIES, f'the odometry is one of {", ".join(ODOMETRIES)}',
              self.odometry),
+            (0 <= self.noise <= 100, 'motion noise is 0 to 100 times the usual', self.noise),
+            (0 <= self.drift <= 100, 'drift is 0 to 100 times the usual', self.drift),
             (self.ranges in RANGES, f'the ranges are one of {", ".join(RANGES)}', self.ranges),
         )
         for kept, rule, received in rules:
@@ -88,7 +93,12 @@ class EnvConfig:
     @property
     def pictures_per_goal(self) -> int:
         """Differently lit pictures kept of each goal."""
-        return self.goal_variants or self.randomisation.pictures_per_goal
+        return self.goal_variants or self.of_goals.pictures_per_goal
+
+    @property
+    def of_goals(self) -> Randomisation:
+        """The randomisation of goal pictures."""
+        return self.goal_randomisation or self.randomisation
 
 
 def with_own_actions(config: EnvConfig, robot: RobotSpec) -> EnvConfig:
@@ -109,7 +119,8 @@ def setup_for(config: EnvConfig, robot: RobotSpec, threads: int = 1) -> Setup:
     models = simulator_class(name).task_objects.get(config.task, ())
     return Setup(
         num_envs=config.num_envs, robot=robot, size=config.size, threads=threads,
-        randomisation=config.randomisation, models=models,
+        randomisation=config.randomisation, goal_randomisation=config.goal_randomisation,
+        models=models,
         objects=config.objects if models else 0, goals_per_room=config.goals_per_room,
         goal_seed=config.goal_seed)
 
@@ -134,6 +145,10 @@ def tells(simulator: Simulator) -> set[str]:
     return {name for name in PRIVILEGED if known.get(name)}
 
 
+def _varies_pictures(config: EnvConfig) -> bool:
+    return config.randomisation.varies_pictures or config.of_goals.varies_pictures
+
+
 def without_the_unknown(config: EnvConfig, simulator: Simulator, optional: Collection[str]
                         ) -> tuple[EnvConfig, list[str]]:
     """A configuration that asks a simulator for nothing that it does not know.
@@ -154,9 +169,11 @@ def without_the_unknown(config: EnvConfig, simulator: Simulator, optional: Colle
     asked = {'progress_reward': config.progress_reward and (can.rewards or not can.geodesic),
              'exploration_reward': (config.exploration_reward
                                     and not have_floors(simulator.places)),
-             'randomisation': config.randomisation.varies_pictures and not can.appearance}
+             'randomisation': _varies_pictures(config) and not can.appearance}
     lost = [name for name in optional if asked[name]]
     words = [f'{name} is left out: {OPTIONAL[name]}' for name in lost]
+    if 'randomisation' in lost:
+        config = dataclasses.replace(config, goal_randomisation=None)
     return dataclasses.replace(
         config, privileged=tuple(name for name in config.privileged if name in known),
         **{name: without[name] for name in lost}), words
@@ -173,7 +190,7 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
         UserError: what it cannot do.
     """
     can, told = simulator.capabilities, set(config.privileged)
-    varies = config.randomisation.varies_pictures
+    varies = _varies_pictures(config)
     own_goals = (config.goals_per_room, config.goal_seed) == (1, 0)
     image = config.task == 'image'
     rules = (

@@ -9,15 +9,14 @@ from vn_sim_bridge.navigation.base_motion import Counters
 from vn_sim_bridge.robot.odometry import advance_all, drift_errors_of_all
 
 _AXES = [0, 0, 1]  # dx and dy are measured by the way, dyaw by the turn
-LEVEL = 1.0  # of `odometry.drift_errors`: a good indoor base with a gyro
 
 
 class EpisodeOdometry:
     """Poses by dead reckoning, in frames that begin at (0, 0, 0) with every episode.
 
     `true` adds up what really happened: motion noise, slip, worn wheels and contacts included.
-    `drift` adds up the same, measured with the errors of `odometry.drift_errors` at drift 1; they
-    are functions of seed, environment, episode and step. `commanded` adds up the nominal moves,
+    `drift` adds up the same, measured with the errors of `odometry.drift_errors`; they are
+    functions of seed, environment, episode and step. `commanded` adds up the nominal moves,
     as far as nothing stood in the way: noise, slip and worn wheels are not seen. That is what the
     sim bridge (`SimulatedRobot`) publishes with its default `odometry_drift` of 0, which counts
     wheel turns in the same way tick by tick. With an `odometry_drift` the bridge adds the errors
@@ -27,13 +26,14 @@ class EpisodeOdometry:
     Args:
         kind: 'true', 'drift' or 'commanded'.
         num_envs: robots N.
+        drift: as of `odometry.drift_errors`; 1: a good indoor base with a gyro.
 
     Attributes:
         poses: [N,3] float64 x, y [m], yaw [rad].
     """
 
-    def __init__(self, kind: str, num_envs: int):
-        self._kind = kind
+    def __init__(self, kind: str, num_envs: int, drift: float = 1.0):
+        self._kind, self._drift = kind, drift
         self.poses = np.zeros((num_envs, 3))
 
     def begin(self, env_ids: np.ndarray) -> None:
@@ -57,7 +57,7 @@ class EpisodeOdometry:
             motion = _commanded(nominal, tried, done)
         elif self._kind == 'drift':
             seeds, numbers, episodes = (part[:, None] for part in counters)
-            errors = drift_errors_of_all(motion, LEVEL, normal(
+            errors = drift_errors_of_all(motion, self._drift, normal(
                 seeds, Stream.EPISODE_ODOMETRY, numbers, episodes,
                 3 * step[:, None] + np.arange(3)))
         self.poses[env_ids] = advance_all(self.poses[env_ids], motion, errors)

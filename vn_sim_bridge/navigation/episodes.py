@@ -59,6 +59,16 @@ def draw_motion_scale(randomisation: Randomisation, seed, env, episode) -> np.nd
     return low + (high - low) * uniform(seed, Stream.BASE, env, episode)
 
 
+def draw_delays(randomisation: Randomisation, seed: int, episode: int
+                ) -> tuple[float, float, float]:
+    """How late an episode's commands, motors and pictures are [s]."""
+    limits = (randomisation.command_delay, randomisation.motor_lag, randomisation.camera_delay)
+    command, motors, camera = (
+        low + (high - low) * float(uniform(seed, Stream.BASE, 0, episode, 1 + k))
+        for k, (low, high) in enumerate(limits))
+    return command, motors, camera
+
+
 def draw_grip(randomisation: Randomisation, seed, env, episode, step) -> np.ndarray:
     """The share of some decisions' motion that wheels on a smooth floor turn into driving."""
     counter = (seed, Stream.SLIP, env, episode, step)

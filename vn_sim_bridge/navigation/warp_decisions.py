@@ -5,8 +5,9 @@ from __future__ import annotations
 import warp as wp
 
 from vn_nav.co_visibility import SLACK, TOLERANCE
+from vn_nav.robot import MAX_TILT
 from vn_sim_bridge.counter_random import Stream
-from vn_sim_bridge.floor.contacts import MAX_TILT, ROTATION_NOISE, TRANSLATION_NOISE
+from vn_sim_bridge.floor.contacts import ROTATION_NOISE, TRANSLATION_NOISE
 from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.navigation.warp_episodes import begin_episode
 from vn_sim_bridge.navigation.warp_motion import distance_at, travel, wrap
@@ -97,8 +98,8 @@ def decide(houses: Houses, robots: Robots, rules: Rules, deltas: wp.array2d(dtyp
     dx, dy = deltas[action, 0] + zero, deltas[action, 1] + zero
     dyaw, dpitch = deltas[action, 2] + zero, deltas[action, 3] + zero
     length = wp.sqrt(dx * dx + dy * dy)
-    if rules.motion_noise == 1:
-        number = normal(rules.seed, _noise_stream, env, episode, step)
+    if rules.motion_noise > _f64(0.0):
+        number = rules.motion_noise * normal(rules.seed, _noise_stream, env, episode, step)
         if length > _f64(0.0):
             scale = _f64(1.0) + _translation_noise * number / length
             dx, dy = dx * scale, dy * scale

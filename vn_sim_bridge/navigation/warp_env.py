@@ -66,6 +66,9 @@ class WarpNavigationEnv:
         if config.stop != 'arrival' or config.exploration_reward:
             raise UserError('on the device episodes end on arrival, and new floor pays nothing',
                             (config.stop, config.exploration_reward), 'use NavigationEnv')
+        if config.noise and not config.turn_noise:
+            raise UserError('on the device turns are as noisy as moves, or nothing is',
+                            'turn_noise=False', 'use NavigationEnv')
         if config.odometry != 'none':
             raise UserError('robots on the device have no odometry', config.odometry,
                             'use NavigationEnv (--device cpu), or odometry none')
@@ -119,7 +122,7 @@ class WarpNavigationEnv:
 
     def _draw_goals(self, task: tasks.ImageGoal, scenes: Sequence[Scene]) -> None:
         """Every goal's pictures, in the lights that `NavigationEnv` shows them in."""
-        varied, size, variants = self.config.randomisation, self.config.size, self._rules.variants
+        varied, size, variants = self.config.of_goals, self.config.size, self._rules.variants
         goal = np.repeat(np.arange(len(task.views)), variants)
         variant = np.tile(np.arange(variants), len(task.views))
         appearance = draw_appearance(varied, self.renderer.rooms, self.config.seed,

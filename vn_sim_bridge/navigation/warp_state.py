@@ -86,7 +86,7 @@ class Rules:
     blank_goal: wp.int64
     difficulty: wp.float64  # tau of `set_difficulty`
     max_decisions: wp.int64
-    motion_noise: wp.int32
+    motion_noise: wp.float64
     progress: wp.float64
     collision: wp.float64
     step_reward: wp.float64
@@ -150,7 +150,7 @@ def make_rules(config: EnvConfig, robot: RobotSpec, houses: int, goals: int, dev
     rules.environments, rules.houses = config.num_envs, houses
     rules.blank_goal = goals * rules.variants
     rules.max_decisions = config.max_decisions
-    rules.motion_noise = int(config.noise)
+    rules.motion_noise = float(config.noise)
     rules.progress, rules.collision = config.progress_reward, config.collision_reward
     rules.step_reward, rules.goal_bonus = config.step_reward, config.goal_bonus
     rules.radius, rules.camera_height = robot.footprint_radius, robot.camera_height

@@ -31,14 +31,17 @@ class DrawnSimulator(BaseSimulator):
                                 rooms=True, walls=True, placeable_objects=True, appearance=True,
                                 other_goals=True)
 
-    def _set_up(self, randomisation: Randomisation | None, objects: int) -> None:
+    def _set_up(self, randomisation: Randomisation | None, objects: int,
+                goal_randomisation: Randomisation | None = None) -> None:
         """Stand in standard light, without objects.
 
         Args:
             randomisation: what `apply_appearance` draws from; None: nothing varies.
             objects: most at a time.
+            goal_randomisation: of goal pictures; None: the same.
         """
         self.randomisation = randomisation or Randomisation()
+        self.goal_randomisation = goal_randomisation or self.randomisation
         self.objects = no_objects(self.num_envs, objects)
         self._all = np.arange(self.num_envs)
         self._frames: Frames | None = None
@@ -65,7 +68,9 @@ class DrawnSimulator(BaseSimulator):
 
     def appearance(self, seed: int | np.ndarray, stream: Stream, env, episode) -> Appearance:
         """Light and camera of some episodes, or of some goal pictures."""
-        return draw_appearance(self.randomisation, self._lamps, seed, stream, env, episode)
+        varied = (self.goal_randomisation if stream == Stream.GOAL_APPEARANCE
+                  else self.randomisation)
+        return draw_appearance(varied, self._lamps, seed, stream, env, episode)
 
     def apply_appearance(self, env_ids: np.ndarray, seed: int | np.ndarray, stream: Stream,
                          env, episode) -> None:
@@ -146,7 +151,7 @@ class DrawnSimulator(BaseSimulator):
     def _draw(self, place_index: np.ndarray, poses: np.ndarray, out: Frames | None,
               appearance: Appearance, keys: np.ndarray | None, objects: Objects | None) -> Frames:
         frames = self._render(place_index, poses, out, appearance, objects)
-        if self.randomisation.noise[1] > 0 or self.randomisation.blur[1] > 0:
+        if appearance.noise.any() or appearance.blur.any():
             if keys is None:
                 keys = np.arange(len(poses)).astype(np.uint64)
             expose(frames.rgb, appearance.noise, appearance.blur, keys)

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,14 @@ from vn_sim_bridge.counter_random import Stream, normal, uniform
 from vn_sim_bridge.render.pack import FACING
 
 Range = tuple[float, float]
+LIMITS = {'daylight': (0, 4), 'daylight_kelvin': (1500, 20000), 'sun': (0, 4), 'lamp': (0, 4),
+          'lamp_kelvin': (1500, 20000), 'exposure': (-4, 4), 'fov_deg': (-45, 45),
+          'height': (-0.5, 0.5), 'pitch_deg': (-45, 45), 'noise': (0, 80), 'blur': (0, 0.2),
+          'motion_scale': (0.2, 2), 'command_delay': (0, 1), 'motor_lag': (0, 1),
+          'camera_delay': (0, 1)}
+MOST_WHITE_BALANCE = 0.5
+BASE = ('motion_scale', 'slip', 'late_picture', 'command_delay', 'motor_lag', 'camera_delay')
+LIGHT = ('daylight', 'daylight_kelvin', 'sun', 'lamp', 'lamp_kelvin', 'exposure')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +55,10 @@ class Randomisation:
     motion_scale: Range = (1.0, 1.0)  # metres driven per metre asked for, an episode
     slip: float = 0.0  # probability that a decision moves only a part of what was asked
     late_picture: float = 0.0  # probability that a picture is the one before
+    # Of time, an episode: only a robot that is driven by velocities (the bridge) has any.
+    command_delay: Range = (0.0, 0.0)  # s until a velocity reaches the wheels' controller
+    motor_lag: Range = (0.0, 0.0)  # s, time constant of the motors
+    camera_delay: Range = (0.0, 0.0)  # s from a picture's stamp until it is published
     goal_variants: int = 8  # differently lit pictures of each goal; 1 where nothing varies
 
     def __post_init__(self):
@@ -59,17 +71,13 @@ class Randomisation:
                     raise UserError(f'{field.name} is a range: two numbers, the lesser first',
                                     value, 'correct the randomisation')
                 object.__setattr__(self, field.name, (float(value[0]), float(value[1])))
-        limits = {'daylight': (0, 4), 'daylight_kelvin': (1500, 20000), 'sun': (0, 4),
-                  'lamp': (0, 4), 'lamp_kelvin': (1500, 20000), 'exposure': (-4, 4),
-                  'fov_deg': (-45, 45), 'height': (-0.5, 0.5), 'pitch_deg': (-45, 45),
-                  'noise': (0, 80), 'blur': (0, 0.2), 'motion_scale': (0.2, 2)}
-        for name, (least, greatest) in limits.items():
+        for name, (least, greatest) in LIMITS.items():
             low, high = getattr(self, name)
             if low < least or high > greatest:
                 raise UserError(f'{name} lies within {least} and {greatest}', (low, high),
                                 'correct the randomisation')
         for name, greatest in (('lamp_on', 1), ('slip', 1), ('late_picture', 1),
-                               ('white_balance', 0.5)):
+                               ('white_balance', MOST_WHITE_BALANCE)):
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and 0 <= value <= greatest):
                 raise UserError(f'{name} lies within 0 and {greatest}', value,
@@ -81,14 +89,49 @@ class Randomisation:
     @property
     def varies_pictures(self) -> bool:
         """Whether two pictures from one pose can differ."""
-        base = ('motion_scale', 'slip', 'late_picture', 'goal_variants')
+        others = (*BASE, 'goal_variants')
         return any(getattr(self, field.name) != field.default
-                   for field in dataclasses.fields(self) if field.name not in base)
+                   for field in dataclasses.fields(self) if field.name not in others)
+
+    @property
+    def varies_time(self) -> bool:
+        """Whether commands, motors or pictures are late."""
+        return any(getattr(self, name) != (0.0, 0.0)
+                   for name in ('command_delay', 'motor_lag', 'camera_delay'))
+
+    def with_light(self, spread: float) -> Randomisation:
+        """With ranges of light and exposure `spread` times as wide, as far as `LIMITS` allow.
+
+        Their middles stay. Lamps are off `spread` times as often. 0: one light for all.
+        """
+        def spread_out(name: str) -> Range:
+            low, high = getattr(self, name)
+            least, greatest = LIMITS[name]
+            more = (spread - 1) * (high - low) / 2
+            return max(low - more, least), min(high + more, greatest)
+
+        changed: dict[str, Any] = {name: spread_out(name) for name in LIGHT}
+        return dataclasses.replace(
+            self, lamp_on=max(self.lamp_on - (spread - 1) * (1 - self.lamp_on), 0.0),
+            white_balance=min(spread * self.white_balance, MOST_WHITE_BALANCE), **changed)
+
+    def with_camera(self, exposure: float = 0.0, blur: float | None = None) -> Randomisation:
+        """With stops added to the exposure, and one length of motion blur.
+
+        Args:
+            exposure: stops.
+            blur: share of the width; None: as it is.
+
+        Raises:
+            UserError: beyond `LIMITS`.
+        """
+        low, high = self.exposure
+        return dataclasses.replace(self, exposure=(low + exposure, high + exposure),
+                                   blur=self.blur if blur is None else (blur, blur))
 
     def of_the_base(self) -> Randomisation:
         """What it varies of the base alone: for simulators that draw no light."""
-        base = {name: getattr(self, name) for name in ('motion_scale', 'slip', 'late_picture')}
-        return Randomisation(**base)
+        return Randomisation(**{name: getattr(self, name) for name in BASE})
 
     @property
     def pictures_per_goal(self) -> int:

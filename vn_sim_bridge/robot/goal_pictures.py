@@ -55,7 +55,7 @@ def load_goal_pictures(folder: str | Path) -> list[GoalPicture]:
                         remedy) from error
     if not (isinstance(entries, list) and entries and all(map(_is_entry, entries))):
         raise UserError(f'{INDEX} lists pictures and their poses', str(path), remedy)
-    return [GoalPicture(read_goal_picture(path.parent / entry['picture']),
+    return [GoalPicture(read_goal_picture(path.parent / entry['picture']).picture,
                         (float(x), float(y), float(yaw)))
             for entry in entries for x, y, yaw in [entry['pose']]]
 

@@ -20,6 +20,7 @@ from vn_sim_bridge.navigation import tasks
 from vn_sim_bridge.navigation.episodes import (
     MIN_START_DISTANCE,
     GoalField,
+    draw_delays,
     draw_goal,
     draw_grip,
     draw_motion_scale,
@@ -66,7 +67,8 @@ class SimulatedRobot:
     Args:
         scene: its name, see `vn_nav.scenes`.
         robot: limits, camera, footprint; its action table gives the noise's nominal sizes.
-        size: side of the pictures [pixels].
+        size: side of the pictures [pixels]; with `aspect` their height, or width if it is less.
+        aspect: width of the pictures over their height. `camera_fov` is of the shorter side.
         noise: Gaussian motion noise; odometry reports the motion without it.
         seed: of starts, goals and noise. Episode e starts as environment e of a `NavigationEnv`
             with the same seed does.
@@ -81,7 +83,7 @@ class SimulatedRobot:
             robots cannot be put anywhere, or its actions are no motions.
     """
 
-    def __init__(self, scene: str, *, robot: RobotSpec, size: int = 84,
+    def __init__(self, scene: str, *, robot: RobotSpec, size: int = 84, aspect: float = 1.0,
                  noise: bool = True, seed: int = 0, max_decisions: int = 300,
                  stop: str = 'arrival', randomisation: Randomisation | None = None,
                  odometry_drift: float = 0.0,
@@ -89,8 +91,16 @@ class SimulatedRobot:
         self.stop_rule = stop
         self.robot, self.noise, self.seed, self.max_decisions = robot, noise, seed, max_decisions
         self.randomisation = randomisation or Randomisation()
-        self.simulator = open_simulator([scene], Setup(1, robot, size,
-                                                       randomisation=self.randomisation))
+        # Simulators draw squares: of a longer picture as wide as it is, which is cut.
+        longer = round(size * max(aspect, 1 / aspect))
+        self.picture_size = (longer, size) if aspect >= 1 else (size, longer)  # width, height
+        self._rows, self._columns = (
+            slice((longer - part) // 2, (longer - part) // 2 + part)
+            for part in ((size, longer) if aspect >= 1 else (longer, size)))
+        whole = 2 * math.atan(longer / size * math.tan(robot.camera_fov / 2))
+        self.simulator = open_simulator([scene], Setup(
+            1, robot if longer == size else dataclasses.replace(robot, camera_fov=whole), longer,
+            randomisation=self.randomisation))
         try:
             self._check_simulator(scene)
         except UserError:
@@ -117,6 +127,7 @@ class SimulatedRobot:
         self._touched = False
         self._share = self._motion_scale = 1.0  # metres driven per metre asked for
         self._shown: Frames | None = None
+        self.camera_delay = 0.0  # s, of this episode: from a picture's stamp to its arrival
         # Compile the motion now, not when the first command is in force.
         self.simulator.move(np.zeros((1, 4)))
 
@@ -176,6 +187,8 @@ class SimulatedRobot:
         self._in_decision = self._touched = False
         self.simulator.apply_appearance(np.array([0]), self.seed, Stream.APPEARANCE, index, 0)
         self._motion_scale = float(draw_motion_scale(self.randomisation, *counter))
+        delay, lag, self.camera_delay = draw_delays(self.randomisation, self.seed, index)
+        self.base.respond(delay, lag)
         self._shown = None
         can = self.simulator.capabilities
         # Steps are no metres: who reads `start_distance` makes figures in metres of it.
@@ -208,8 +221,9 @@ class SimulatedRobot:
         variant = (index if goal < 0 else
                    draw_variant(variants, self.seed, index, 0))
         counter = (self.seed, Stream.GOAL_APPEARANCE, np.array([goal]), np.array([variant]))
-        return self.simulator.view(np.zeros(1, np.int64), np.array([self.goal.pose]), None,
-                                   self.simulator.appearance(*counter), key(*counter, 99))
+        return self._cut(self.simulator.view(
+            np.zeros(1, np.int64), np.array([self.goal.pose]), None,
+            self.simulator.appearance(*counter), key(*counter, 99)))
 
     def observe(self) -> Frames:
         """The camera's picture; with a late camera at times the one before."""
@@ -218,8 +232,12 @@ class SimulatedRobot:
         if self._shown is None or uniform(*counter) >= self.randomisation.late_picture:
             frames = self.simulator.observe(keys=np.atleast_1d(
                 key(self.seed, Stream.SENSOR, index, 0, self.tick_count)))
-            self._shown = Frames(*(part.copy() for part in frames))
+            self._shown = Frames(*(part.copy() for part in self._cut(frames)))
         return self._shown
+
+    def _cut(self, frames: Frames) -> Frames:
+        """Pictures of the camera's format out of the simulator's."""
+        return Frames(*(part[..., self._rows, self._columns] for part in frames))
 
     def distance(self) -> float:
         """Geodesic distance to the goal [m; steps on a grid]."""
@@ -236,7 +254,8 @@ class SimulatedRobot:
         """
         command = np.asarray(command, float)
         velocity = self.base.follow(command, self.velocity)
-        return self._advance(velocity, at_rest=not (velocity.any() or command.any()))
+        return self._advance(velocity, at_rest=not (velocity.any() or command.any()
+                                                    or self.base.late))
 
     def tick(self, velocity: np.ndarray) -> Decision | None:
         """Advance by one tick at a velocity, whatever the limits: a whole action may be one tick.
@@ -303,6 +322,11 @@ class SimulatedRobot:
             return 0.0, 0.0, 0.0
         numbers = normal(self.seed, Stream.ODOMETRY, np.arange(3), 0, self.tick_count)
         return drift_errors(turned, self.odometry_drift, numbers)
+
+    @property
+    def moves(self) -> bool:
+        """It moves, or what was asked for before will move it."""
+        return bool(self.velocity.any()) or self.base.late
 
     @property
     def in_decision(self) -> bool:

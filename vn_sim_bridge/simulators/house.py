@@ -67,6 +67,7 @@ class HouseSimulator(DrawnSimulator):
         randomisation: what `apply_appearance` draws light and camera from; default: nothing
             varies.
         models: names of the objects that may stand in the houses; objects: most at a time.
+        goal_randomisation: of goal pictures; default: the same.
     """
 
     places: list[House]
@@ -81,12 +82,13 @@ class HouseSimulator(DrawnSimulator):
         houses = open_houses(scenes, setup.goals_per_room, setup.goal_seed)
         return cls(houses, np.arange(setup.num_envs) % len(houses), robot=setup.robot,
                    size=setup.size, threads=setup.threads, randomisation=setup.randomisation,
-                   models=setup.models, objects=setup.objects)
+                   models=setup.models, objects=setup.objects,
+                   goal_randomisation=setup.goal_randomisation)
 
     def __init__(self, houses: Sequence[House], place_index: Sequence[int] | np.ndarray, *,
                  robot: RobotSpec, size: int = 84, threads: int = 1,
                  randomisation: Randomisation | None = None, models: Sequence[str] = (),
-                 objects: int = 0):
+                 objects: int = 0, goal_randomisation: Randomisation | None = None):
         self.places = list(houses)
         for house in self.places:
             if robot.footprint_radius > house.footprint_radius:
@@ -101,7 +103,7 @@ class HouseSimulator(DrawnSimulator):
         self._renderer: Rasterizer | None = Rasterizer(  # None: closed
             [*(house.scene for house in self.places), *map(object_scene, models)], size,
             threads=threads)
-        self._set_up(randomisation, objects)
+        self._set_up(randomisation, objects, goal_randomisation)
 
     @property
     def _painter(self) -> Rasterizer:

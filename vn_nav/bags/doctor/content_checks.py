@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vn_msgs_py.camera import field_of_view
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
 from vn_nav.bags.doctor.figures import (
@@ -20,8 +19,10 @@ from vn_nav.bags.doctor.figures import (
     Motion,
     ReceivedTopic,
 )
+from vn_nav.calibration import read_calibration
 from vn_nav.errors import UserError
-from vn_nav.observation import check_lens, crop_fraction, fov_across
+from vn_nav.observation import check_camera
+from vn_nav.rectification import Camera
 
 PICTURE_PERIOD_NS = 500_000_000  # ns between pictures that are decoded
 BLACK_LEVEL = 16  # of 255: no pixel of a picture's thumbnail is brighter
@@ -47,6 +48,7 @@ class ContentChecks:
     def __init__(self, findings: Findings, fov: float | None, any_lens: bool = False):
         self._add, self._fov, self._any_lens = findings.add, fov, any_lens
         self.odometry, self.command = Motion(), Command()
+        self._camera: Camera | None = None
         self._lens: tuple[float, int, int] | None = None  # focal length, width, height [pixels]
 
     def examine(self, topic: ReceivedTopic, value: Any, at: int) -> None:
@@ -90,6 +92,10 @@ class ContentChecks:
         if not raw:
             self._shape(topic, f'{_short(value.format)} {picture.shape[1]} x '
                         f'{picture.shape[0]}', at)
+        if topic.role == 'image' and self._camera is not None and not self._camera.fits(picture):
+            self._add(ERROR, name, 'format', f'is {picture.shape[1]} x {picture.shape[0]}, '
+                      'another format than that of its camera_info', at,
+                      'record the camera_info that belongs to these pictures')
         small = cv2.resize(picture, (16, 16), interpolation=cv2.INTER_AREA)
         if small.max() < BLACK_LEVEL:
             self._add(WARNING, name, 'black', 'is black', at, 'remove the lens cap, switch on the '
@@ -130,13 +136,19 @@ class ContentChecks:
             self._add(WARNING, name, 'focal', f'has a focal length of {lens[0]:g} pixels at '
                       f'{lens[1]} x {lens[2]}', at, 'calibrate the camera (camera_calibration): '
                       'pictures cannot be cropped for a policy')
-        elif self._fov is not None:
-            fov = field_of_view(*lens[1:], lens[0])
+            return
+        try:
+            calibration = read_calibration(info)
+            assert calibration is not None  # it has a focal length and a size
+            self._camera = Camera(calibration, self._fov or 0.0)
+        except UserError as error:
+            self._add(ERROR, name, 'lens', f'cannot be used: {error.rule}, not {error.received}',
+                      at, error.remedy)
+            return
+        if self._fov is not None:
+            fov = self._camera.fov
             try:
-                if self._any_lens:
-                    check_lens(fov_across(fov, lens[1] / lens[2]))
-                else:
-                    crop_fraction(fov, self._fov)
+                check_camera(fov, self._camera.aspect, self._fov, any_lens=self._any_lens)
             except UserError as error:
                 self._add(ERROR, name, 'narrow', f'is of a camera with '
                           f'{math.degrees(fov):.0f} deg on its shorter side: {error.rule}', at,

@@ -128,7 +128,7 @@ def _episode(drives: DriveSet, steps: slice, goal: np.ndarray, checkpoint: Loade
     """The policy's answer at each step of an episode."""
     import torch
 
-    from vn_nav.policy.runtime import BatchedPolicy
+    from vn_nav.policy.batched import BatchedPolicy
     policy, actions = BatchedPolicy(checkpoint.network, 1, 'greedy'), checkpoint.config.actions
     goals, before = np.array(goal)[None], NO_ACTION
     # By odometry, or by the commands, in the frame of the episode, as a simulator observes it.

@@ -38,6 +38,8 @@ class Shadow:
     # Of the policy's action filter, as the node's last diagnostics had them: `decisions`, and at
     # how many it `acted` and `changed` the action; None: it has none, or an older node drove.
     filtered: dict[str, int] | None = None
+    # Decisions whose map took measured ranges, by the same; None: they were not asked for.
+    ranges: int | None = None
 
     @property
     def beside_the_drive(self) -> tuple[int, int]:
@@ -91,6 +93,7 @@ def read_shadow(bag: str | Path) -> Shadow:
     choices: dict[int, str] = {}
     commands: dict[int, np.ndarray] = {}
     filtered: dict[str, int] | None = None
+    ranges: int | None = None
     episode = -1
     for record in messages(bag, [f'shadow/{name}' for name in (
             'action', 'action_names', 'arrived', 'cmd_vel', 'diagnostics', 'executed_action',
@@ -108,7 +111,9 @@ def read_shadow(bag: str | Path) -> Shadow:
             case 'arrived' if record.message.data:
                 choices[time] = ARRIVED
             case 'diagnostics':
-                filtered = _filtered(record.message) or filtered
+                said = _said(record.message)
+                filtered = _filtered(said) or filtered
+                ranges = int(said['ranges_used']) if 'ranges_used' in said else ranges
             case 'cmd_vel':
                 commands[time] = twist_to_array(record.message)
     if not executed:
@@ -116,13 +121,17 @@ def read_shadow(bag: str | Path) -> Shadow:
                         'give --checkpoint and --compare to that command')
     following = {one: executed[other][1] for one, other in itertools.pairwise(executed)
                  if executed[one][0] == executed[other][0]}
-    return Shadow([Answer(time, own, choices[time], following.get(time))
-                   for time, (own, _) in executed.items() if time in choices], commands, filtered)
+    answers = [Answer(time, own, choices[time], following.get(time))
+               for time, (own, _) in executed.items() if time in choices]
+    return Shadow(answers, commands, filtered, ranges)
 
 
-def _filtered(diagnostics) -> dict[str, int] | None:
+def _said(diagnostics) -> dict[str, str]:
+    return {pair.key: pair.value for status in diagnostics.status for pair in status.values}
+
+
+def _filtered(said: dict[str, str]) -> dict[str, int] | None:
     """The counts of the action filter, where a node says them."""
-    said = {pair.key: pair.value for status in diagnostics.status for pair in status.values}
     names = 'decisions', 'acted', 'changed'
     if not all(said.get(f'filter_{name}', '').isdecimal() for name in names):
         return None

@@ -20,11 +20,13 @@ import numpy as np
 
 from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array, twist_to_array
+from vn_msgs_py.picture_file import DecodedPicture
 from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.drive import Report, find_topics
 from vn_nav.bags.drive_decoder import read_steps
 from vn_nav.bags.roles import COMPRESSED, Topics, full_name
 from vn_nav.bags.segmenter import NO_ACTION
+from vn_nav.bags.shadow.ranges import Ranges, RangesBeside, find_ranges
 from vn_nav.bags.storage.decoding import Decoder
 from vn_nav.bags.storage.stream import Bag, summary
 from vn_nav.errors import UserError
@@ -56,6 +58,7 @@ class Event(NamedTuple):
     data: bytes | None  # CDR as it was; None: a tick without odometry
     picture: bool
     decision: Decision | None
+    ranges: Ranges | None = None  # that were measured at the picture of a decision, if asked for
 
     @property
     def picture_data(self) -> bytes:
@@ -76,6 +79,9 @@ class Plan:
     goals: Goals
     report: Report
     camera_info: bytes | None  # the first, CDR
+    camera: tuple[float, float] | None  # rad of the pictures' shorter side, width over height
+    ranges: str = ''  # topic of measured ranges, as in the bag; '': they are not asked for
+    depth_info: bytes | None = None  # the first camera_info beside depth pictures, CDR
     unreadable: int = 0  # pictures that could not be decoded, after `events`
 
     def events(self) -> Iterator[Event | None]:
@@ -89,6 +95,7 @@ class Plan:
         ticks = self.topics.odometry or self.topics.command
         driving = unseen = False  # in an episode; its last decision was at no picture
         moving = self.topics.image, ticks
+        beside = RangesBeside(self.bag, self.topics, self.ranges) if self.ranges else None
         for message in Bag(self.bag).in_time_order(moving, clocks=moving):
             stamp = decode.header_stamp(message) or 0
             _check_times(self.bag, message.log_time, stamp)
@@ -109,22 +116,28 @@ class Plan:
                      if readable and (driving or decision is not None) else None)
             if decision is not None:
                 driving = (driving or readable) and not decision.last
-            yield None if shown is None else Event(message.log_time, shown, message.data, True,
-                                                   decision)
+            if shown is None:
+                yield None
+                continue
+            own = stamp or message.log_time
+            ranges = (None if beside is None or decision is None
+                      else beside.at(message.log_time, own))
+            yield Event(message.log_time, shown, message.data, True, decision,
+                        ranges and ranges._replace(stamp=shown + ranges.stamp - own))
 
 
 class Goals:
     """A goal picture for each episode, kept on disk.
 
     Args:
-        everywhere: [H,W,3] uint8 where the bag shows none; None: the episode's last picture.
+        everywhere: where the bag shows none; None: the episode's last picture.
 
     Attributes:
         shown: episodes with a goal of the bag.
         hindsight: episodes whose goal is their last picture.
     """
 
-    def __init__(self, everywhere: np.ndarray | None = None):
+    def __init__(self, everywhere: DecodedPicture | None = None):
         self._file = tempfile.TemporaryFile()
         self._places: dict[int, tuple[int, tuple[int, ...]]] = {}  # by episode
         self._everywhere = everywhere
@@ -147,8 +160,8 @@ class Goals:
             self._places[episode] = self._file.tell(), picture.shape
             self._file.write(picture.tobytes())
 
-    def picture(self, episode: int) -> np.ndarray | None:
-        """[H,W,3] uint8 RGB; None: it has none that can be decoded."""
+    def picture(self, episode: int) -> DecodedPicture | None:
+        """The goal; its field of view is None for the robot's own. None: it cannot be decoded."""
         if episode not in self._places:
             return self._everywhere
         place, shape = self._places[episode]
@@ -156,7 +169,7 @@ class Goals:
         self._file.seek(place)
         data = self._file.read(math.prod(shape))
         self._file.seek(end)
-        return np.frombuffer(data, np.uint8).reshape(shape)
+        return DecodedPicture(np.frombuffer(data, np.uint8).reshape(shape), None)
 
 
 class _Clock:
@@ -195,23 +208,27 @@ class _Clock:
 
 
 def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
-              goal: np.ndarray | None = None) -> Plan:
+              goal: DecodedPicture | None = None, ranges: str = '') -> Plan:
     """Cut a drive into the actions of a robot.
 
     Args:
         bag: a rosbag2 folder or an MCAP file.
-        robot: its actions, and the field of view that the policy needs.
+        robot: its actions.
         topics: names in the bag.
         goal: picture where the bag shows none; None: the last picture of each episode.
+        ranges: 'scan' or 'depth': the topic of this role is for the policy's map; '': none is.
 
     Raises:
-        UserError: no readable bag, topics or types that are not there, a camera that is too
-            narrow, or nothing to decide at.
+        UserError: no readable bag, topics or types that are not there, or nothing to decide at.
     """
     report = Report()
-    wanted = dataclasses.replace(topics, depth='', labels='')
+    wanted = dataclasses.replace(topics, depth='', labels='', scan='')
     found = find_topics(bag, wanted)
-    steps, facts = read_steps(bag, Wanted(robot, topics=wanted), report)
+    measured, depth_info = '', ''
+    if ranges:
+        kept = dataclasses.replace(wanted, **{ranges: getattr(topics, ranges)})
+        measured, depth_info = find_ranges(bag, find_topics(bag, kept), kept, ranges)
+    steps, facts, lens = read_steps(bag, Wanted(robot, topics=wanted), report)
     decisions: list[Decision] = []
     goals, done = Goals(goal), None
     for step in steps:
@@ -232,9 +249,12 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
         raise UserError('a bag for shadow mode holds pictures with matching poses',
                         f'{bag}: {report.pictures} pictures, {report.without_pose} without a '
                         'pose', 'see `vn_nav bag doctor`')
+    camera_info = camera = None
+    if lens is not None:
+        camera_info, camera = _first(bag, found.camera_info), (lens.fov, lens.aspect)
     return Plan(Path(bag), found, full_name(summary(bag)[found.image].type) == COMPRESSED,
                 _rate(bag, found.odometry or found.command), decisions, goals, report,
-                _first(bag, found.camera_info) if facts['fov'] is not None else None)
+                camera_info, camera, measured, _first(bag, depth_info) if depth_info else None)
 
 
 def stamped(data: bytes, stamp: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Drives robots by a `SearchPolicy`: its networks see, a `Searcher` for each robot decides."""
+"""Drives robots that search: `Eyes` see, a `Searcher` for each robot decides."""
 
 from __future__ import annotations
 
@@ -6,52 +6,63 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from vn_nav.lens import SAME, bearings_through
 from vn_nav.measured_ranges import Scan, laser_scan
 from vn_nav.policy.action_filter import UNCHANGED_GREY_LEVELS, thumbnails
 from vn_nav.policy.search.costmap import Costmap
+from vn_nav.policy.search.eyes import Eyes
 from vn_nav.policy.search.key_pictures import KeyPictures, Mode
 from vn_nav.policy.search.lens import in_metres, ranges_in_metres
 from vn_nav.policy.search.local_features import compare
-from vn_nav.policy.search.look import BINS, COLUMNS, RANGE_EDGES, Look, column_bearings
-from vn_nav.policy.search.network import SearchPolicy
+from vn_nav.policy.search.look import (
+    BINS,
+    COLUMNS,
+    RANGE_EDGES,
+    Look,
+    column_bearings,
+    goal_ranges,
+)
 from vn_nav.policy.search.recall import Recall
 from vn_nav.policy.search.registration import Registration
 from vn_nav.policy.search.searcher import Searcher, Sight
-from vn_nav.policy.search.verification import Pair, verified
+from vn_nav.policy.search.verification import verified
+from vn_nav.policy.search.views import Pair
 
 
 class SearchDriver:
     """Of N robots.
 
     Args:
-        network: what sees.
+        eyes: what sees.
         num_envs: robots, N.
         pitch: down, of the cameras [rad]; where local features are given alone.
+        max_decisions: of an episode; None: nobody knows.
 
     Attributes:
+        max_decisions: as given.
         searchers: [N], with map and hypotheses of each robot.
-        recalls: [N], what each recalls of the place that the network was taught; None: of none.
+        recalls: [N], what each recalls of the place that the policy was taught; None: of none.
         arrival: [N] float32 probability that the robots have arrived, at the newest pictures.
     """
 
-    def __init__(self, network: SearchPolicy, num_envs: int, pitch: float = 0.0):
-        config = network.config
-        self.network, self._pitch = network, pitch
+    def __init__(self, eyes: Eyes, num_envs: int, pitch: float = 0.0,
+                 max_decisions: int | None = None):
+        config = eyes.config
+        self.eyes, self._pitch = eyes, pitch
         self._bearings = bearings = column_bearings(config.view)
         self.searchers = [Searcher(config.moves, bearings, RANGE_EDGES, config.footprint,
-                                   network.rules)
+                                   eyes.rules)
                           for _ in range(num_envs)]
-        place = network.taught
-        self._keys = None if place is None else KeyPictures(network, place)
+        place = eyes.taught
+        self._keys = None if place is None else KeyPictures(eyes, place)
         self.recalls = None if place is None or self._keys is None else [
             Recall(place, self._keys) for _ in range(num_envs)]
-        self._goal: tuple[Tensor, list[Mode]] | None = None
+        self._goal: tuple[np.ndarray, list[Mode]] | None = None
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self._before: np.ndarray | None = None
+        self.max_decisions = max_decisions
+        self._decided = np.zeros(num_envs, np.int64)  # in these episodes
         self._compile(Searcher(config.moves, bearings, RANGE_EDGES, config.footprint))
 
     @staticmethod
@@ -69,18 +80,17 @@ class SearchDriver:
             searcher.step(sight, -1, np.zeros(3), scan=laser_scan(np.ones(4), 0.0, 1.0, 0.1, 2.0))
         Costmap(searcher.grid).free_length(searcher.pose, 0.0, 0.5)  # of moves aside and back
 
-    def prepare(self, goal_maps: Tensor) -> None:
+    def prepare(self, goal_maps: np.ndarray) -> None:
         """Look for a goal [1,...] in the taught place now, so that the first `act` need not."""
         if self._keys is not None:
             self._goal = goal_maps, self._keys.poses_of_goal(goal_maps)
 
-    def _poses_of_goal(self, keys: KeyPictures, goal_maps: Tensor) -> list[Mode]:
-        if self._goal is not None and goal_maps.equal(self._goal[0]):
+    def _poses_of_goal(self, keys: KeyPictures, goal_maps: np.ndarray) -> list[Mode]:
+        if self._goal is not None and np.array_equal(goal_maps, self._goal[0]):
             return self._goal[1]
         return keys.poses_of_goal(goal_maps)
 
-    @torch.inference_mode()
-    def act(self, image: np.ndarray, goal_maps: Tensor, last_action: np.ndarray,
+    def act(self, image: np.ndarray, goal_maps: np.ndarray, last_action: np.ndarray,
             starts: np.ndarray, odometry: np.ndarray | None,
             scans: Sequence[Scan | None] | None = None, zoom: float = 1.0,
             pairs: Sequence[Pair | None] | None = None) -> np.ndarray:
@@ -88,7 +98,7 @@ class SearchDriver:
 
         Args:
             image: [N,3,S,S] uint8.
-            goal_maps: [N,...], of each robot's goal.
+            goal_maps: [N,...] float32 of `Eyes.encode_goals`, of each robot's goal.
             last_action: [N], -1: none.
             starts: [N] bool, where an episode begins: map and hypotheses are empty.
             odometry: [N,3] x, y [m], yaw [rad]; None: nobody has any.
@@ -100,9 +110,8 @@ class SearchDriver:
         Raises:
             FloatingPointError: what the networks say is not finite.
         """
-        pictures = torch.from_numpy(image)
-        look = self.network.look(pictures, goal_maps)
-        if not all(torch.isfinite(part).all() for part in look):
+        look = self.eyes.look(image, goal_maps)
+        if not all(np.isfinite(part).all() for part in look):
             raise FloatingPointError('what the policy sees is not finite')
         sights = sights_of(in_metres(look, self._bearings, zoom))
         bearings = bearings_through(self._bearings, zoom)
@@ -114,9 +123,9 @@ class SearchDriver:
         for n, (searcher, sight) in enumerate(zip(self.searchers, sights, strict=True)):
             if starts[n]:
                 searcher.reset()
-                ranges = ranges_in_metres(self.network.goal_ranges(goal_maps[n:n + 1]),
-                                          self._bearings, zoom)
-                searcher.registration = Registration(bearings, ranges[0].exp().numpy())
+                self._decided[n] = 0
+                ranges = ranges_in_metres(goal_ranges(goal_maps[n:n + 1]), self._bearings, zoom)
+                searcher.registration = Registration(bearings, np.exp(ranges[0]))
             pair = None if pairs is None else pairs[n]
             if pair is not None:
                 sight = verified(sight, compare(pair.own, pair.goal, self._pitch))
@@ -127,21 +136,22 @@ class SearchDriver:
                 own = self.recalls[n]
                 if starts[n]:
                     own.begin(self._poses_of_goal(self._keys, goal_maps[n:n + 1]))
-                recall = functools.partial(own.look, image=pictures[n:n + 1])
+                recall = functools.partial(own.look, image=image[n:n + 1])
             searcher.bearings = bearings
             actions[n] = searcher.step(sight, -1 if starts[n] else int(last_action[n]),
                                        None if odometry is None else odometry[n],
                                        unmoved=bool(still[n]) and not starts[n],
-                                       scan=None if scans is None else scans[n], recall=recall)
+                                       scan=None if scans is None else scans[n], recall=recall,
+                                       remaining=None if self.max_decisions is None else
+                                       self.max_decisions - int(self._decided[n]))
+            self._decided[n] += 1
             self.arrival[n] = searcher.arrival
         return actions
 
 
 def sights_of(look: Look) -> list[Sight]:
-    """What is seen of each picture, as probabilities in NumPy's memory."""
-    ranges = look.ranges.exp().numpy()
-    position, sigma = look.position.numpy(), look.position_sigma.numpy()
-    heading = look.heading.numpy()
-    co_visible, arrived = (torch.sigmoid(part).numpy() for part in (look.co_visible, look.arrived))
-    return [Sight(ranges[n], position[n], float(sigma[n]), heading[n], float(co_visible[n]),
-                  float(arrived[n])) for n in range(len(ranges))]
+    """What is seen of each picture, as probabilities."""
+    ranges = np.exp(look.ranges)
+    co_visible, arrived = ((1 + np.tanh(part / 2)) / 2 for part in (look.co_visible, look.arrived))
+    return [Sight(ranges[n], look.position[n], float(look.position_sigma[n]), look.heading[n],
+                  float(co_visible[n]), float(arrived[n])) for n in range(len(ranges))]

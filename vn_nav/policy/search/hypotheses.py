@@ -133,9 +133,10 @@ class Hypotheses:
         return sorted((own for own in self.all if own.weight >= least * AGAIN**own.refuted),
                       key=lambda own: -own.weight / AGAIN**own.refuted)
 
-    def best(self) -> Hypothesis | None:
-        """The one with most evidence."""
-        return max(self.all, key=lambda own: own.weight, default=None)
+    def best(self, *, untried: bool = False) -> Hypothesis | None:
+        """The one with most evidence; with `untried` of those that were never refuted."""
+        return max((own for own in self.all if not (untried and own.refuted)),
+                   key=lambda own: own.weight, default=None)
 
     def _near(self, pose: np.ndarray) -> Hypothesis | None:
         """The one with most evidence of those that a vote for a pose is for."""

@@ -7,25 +7,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn import functional as F
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.pose_graph import between, compose
-from vn_nav.policy.encoders import apply, directions
+from vn_nav.policy.search.eyes import Eyes, Placed, goal_places
 from vn_nav.policy.search.lens import pose_in_metres
-from vn_nav.policy.search.network import (
-    PER_AXIS,
-    Recognition,
-    SearchPolicy,
-    heading_deviation,
-    views_of,
-)
 from vn_nav.policy.search.taught import TaughtPlace
 
 ALIKE, TRACKED = 8, 4  # key pictures that a picture is compared with: most alike; about the robot
-POOLED = 4  # a side of the maps by which likeness is judged
 VIEW_M, VIEW_RAD = 0.6, math.radians(35)  # a key picture so near is about the robot
 VOTES_FROM, ODDS_MOST = 1.5, 20.0  # odds of co-visibility that vote, and what is the most
 NEAR = 0.7  # m: from here on a key picture is worth no more for being nearer
@@ -69,39 +58,34 @@ class _Seen(NamedTuple):
 
 
 class KeyPictures:
-    """The key pictures of a place, seen by a network.
+    """The key pictures of a place, seen by a policy's eyes.
 
     Args:
-        network: the policy.
-        place: what it was taught.
+        eyes: what sees.
+        place: what the policy was taught.
 
     Attributes:
         poses: [K,3] in the frame of the drive.
     """
 
-    @torch.inference_mode()
-    def __init__(self, network: SearchPolicy, place: TaughtPlace):
-        self.network, self.poses = network, place.poses.astype(float)
+    def __init__(self, eyes: Eyes, place: TaughtPlace):
+        self._eyes, self.poses = eyes, place.poses.astype(float)
         self._zoom = float(place.zoom[0])
-        pictures = torch.from_numpy(place.pictures)
-        self._seen = torch.cat([network.see(part) for part in pictures.split(64)])
-        self._maps = torch.cat([network.encode_goals(part) for part in pictures.split(64)])
-        self._pooled = _pooled(views_of(self._maps, self._seen)[:, 0]).flatten(0, 1)
+        self._seen = eyes.see(place.pictures).features
+        self._maps = eyes.encode_goals(place.pictures)
+        self._places = goal_places(self._maps, self._seen.shape[2:])
 
-    @torch.inference_mode()
-    def poses_of_goal(self, goal_maps: Tensor) -> list[Mode]:
+    def poses_of_goal(self, goal_maps: np.ndarray) -> list[Mode]:
         """Where a goal picture may have been taken, the best first.
 
         Args:
-            goal_maps: [1,...] of `encode_goals`.
+            goal_maps: [1,...] of `Eyes.encode_goals`.
         """
-        said = [self.network.compare(part, goal_maps.expand(len(part), *goal_maps.shape[1:]))
-                for part in self._seen.split(64)]
-        seen = self._in_metres(Recognition(*map(torch.cat, zip(*said, strict=True))))
+        seen = self._in_metres(self._eyes.compare(
+            self._seen, np.repeat(goal_maps, len(self._seen), axis=0)))
         return modes_of(_votes(compose(self.poses, seen.there), seen, turned=False))
 
-    @torch.inference_mode()
-    def recognise(self, image: Tensor, about: np.ndarray | None) -> tuple[list[Mode], float]:
+    def recognise(self, image: np.ndarray, about: np.ndarray | None) -> tuple[list[Mode], float]:
         """Where a picture [1,3,S,S] may have been taken, the best first.
 
         Args:
@@ -112,11 +96,9 @@ class KeyPictures:
             The poses, and the highest co-visibility of the key pictures close to `about`; nan
             where there is none so close.
         """
-        network = self.network
-        seen = network.see(image)
-        query = _pooled(directions(apply(network.encoder.query, seen[:, 0])))[0]
-        alike = (self._pooled @ query.T).unflatten(0, (len(self.poses), -1))  # [K,keys,query]
-        score = (alike.amax(1).mean(1) + alike.amax(2).mean(1)).numpy()
+        seen = self._eyes.see(image)
+        alike = self._places @ seen.places[0].T  # [K,keys,query]
+        score = alike.max(axis=1).mean(axis=1) + alike.max(axis=2).mean(axis=1)
         rows = np.argsort(-score)[:ALIKE]
         close = np.zeros(0, np.int64)
         if about is not None:
@@ -125,26 +107,18 @@ class KeyPictures:
             close = np.argsort(off)[:TRACKED]
             rows = np.union1d(rows, close)
             close = close[off[close] < 1]
-        said = network.compare(seen.expand(len(rows), *seen.shape[1:]),
-                               self._maps[torch.from_numpy(rows)])
-        found = self._in_metres(said)
+        found = self._in_metres(self._eyes.compare(
+            np.repeat(seen.features, len(rows), axis=0), self._maps[rows]))
         poses = compose(self.poses[rows], between(found.there, np.zeros(3)))
         votes = _votes(poses, found, turned=True)
         tracked = votes.odds[np.isin(rows, close)]
         return modes_of(votes), float(
             (tracked / (1 + tracked)).max()) if len(tracked) else math.nan
 
-    def _in_metres(self, said: Recognition) -> _Seen:
-        position, sigma, heading, heading_sigma = (part.numpy() for part in pose_in_metres(
-            said.position, PER_AXIS * said.log_scale.exp(), said.heading,
-            heading_deviation(said.log_concentration), self._zoom))
+    def _in_metres(self, said: Placed) -> _Seen:
+        position, sigma, heading, heading_sigma = pose_in_metres(*said[:4], self._zoom)
         return _Seen(np.column_stack([position, np.arctan2(heading[:, 1], heading[:, 0])]), sigma,
-                     heading_sigma, said.co_visible.numpy())
-
-
-def _pooled(maps: Tensor) -> Tensor:
-    """Directions [N,P,C] of maps [N,C,h,w], of fewer places."""
-    return directions(F.adaptive_avg_pool2d(maps, POOLED)).permute(0, 2, 3, 1).flatten(1, 2)
+                     heading_sigma, said.co_visible)
 
 
 def _votes(poses: np.ndarray, seen: _Seen, turned: bool) -> Votes:

@@ -6,7 +6,6 @@ Shapes: N pictures, G distinct goals, S side of the square pictures [pixels], F 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -14,33 +13,24 @@ from torch.nn import functional as F
 
 from vn_nav.errors import UserError
 from vn_nav.observation import Observation
-from vn_nav.policy.encoders import Matching, Pixels, apply, channels_last, orthogonal
+from vn_nav.policy.encoders import Matching, Pixels, apply, averaged, channels_last, orthogonal
 from vn_nav.policy.heads import NEAR
 from vn_nav.policy.memory import RecurrentState
 from vn_nav.policy.network import Latents, Policy, PolicyOutput
 from vn_nav.policy.network_config import NetworkConfig
-from vn_nav.policy.search.look import BINS, COLUMNS, Look
+from vn_nav.policy.search.look import (
+    BINS,
+    COLUMNS,
+    LOG_CONCENTRATIONS,
+    PER_AXIS,
+    Look,
+    Recognition,
+    heading_deviation,
+)
 from vn_nav.policy.search.rules import Rules
 from vn_nav.policy.search.taught import TaughtPlace
 
 LOG_SCALES = -3.5, 2.0  # of the position, log of metres: 0.03 to 7.4 m
-LOG_CONCENTRATIONS = -3.0, 6.0  # of the heading: from all but uniform to 3 degrees
-PER_AXIS = math.sqrt(3.0)  # deviation along an axis, in scales of the position's distribution
-
-
-class Recognition(NamedTuple):
-    """Where the goal of N pairs stands, as distributions; float32.
-
-    The position's density falls as exp(-distance / scale) about its centre, in the plane; the
-    heading's is von Mises'.
-    """
-
-    position: Tensor  # [N,2] x forward, y left [m]
-    log_scale: Tensor  # [N] of the position [log m]
-    heading: Tensor  # [N,2] cos, sin of the goal's heading less the robot's
-    log_concentration: Tensor  # [N] of the heading
-    co_visible: Tensor  # [N] logit
-    arrived: Tensor  # [N] logit
 
 
 class Recogniser(nn.Module):
@@ -97,7 +87,7 @@ class Ranges(nn.Module):
             assert bias is not None  # as they are made
             x = F.relu(F.conv2d(x, weight, bias.to(dtype), layer.stride, layer.padding))
         if x.shape[2:] != (self.ROWS, COLUMNS):
-            x = F.adaptive_avg_pool2d(x, (self.ROWS, COLUMNS))
+            x = averaged(x, self.ROWS, COLUMNS)
         x = apply(self.out, F.relu(apply(self.read, x)))
         return F.log_softmax(x.float().squeeze(2).transpose(1, 2), dim=-1)
 
@@ -138,10 +128,6 @@ class SearchPolicy(Policy):
                 for pictures in (goals, goals.flip(-1))]
         return torch.cat([*maps, self.see_ranges(goals).flatten(1).to(maps[0].dtype)], dim=1)
 
-    def goal_ranges(self, goal_maps: Tensor) -> Tensor:
-        """Log-probabilities [G,COLUMNS,BINS] float32 of the ranges in goals, of `encode_goals`."""
-        return goal_maps[:, -COLUMNS * BINS:].float().unflatten(1, (COLUMNS, BINS))
-
     def see(self, pictures: Tensor) -> Tensor:
         """What `compare` takes of pictures [N,3,S,S] uint8 and their mirror images: [N,2,...]."""
         return torch.stack([self.encoder.see(own, self.compute_dtype)
@@ -162,7 +148,7 @@ class SearchPolicy(Policy):
         return agreed(own, mirrored(other))
 
     def look(self, image: Tensor, goal_maps: Tensor, goal_index: Tensor | None = None) -> Look:
-        """What is seen, in pictures and their mirror images together.
+        """What is seen, in pictures and their mirror images together; not for learning.
 
         Args:
             image: [N,3,S,S] uint8.
@@ -173,13 +159,14 @@ class SearchPolicy(Policy):
             goal_maps = goal_maps.index_select(0, goal_index)
         seen = self.compare(self.see(image), goal_maps)
         return Look(self.see_ranges(image), seen.position, PER_AXIS * seen.log_scale.exp(),
-                    seen.heading, heading_deviation(seen.log_concentration), seen.co_visible,
-                    seen.arrived)
+                    seen.heading,
+                    torch.from_numpy(heading_deviation(seen.log_concentration.numpy())),
+                    seen.co_visible, seen.arrived)
 
     def see_ranges(self, image: Tensor) -> Tensor:
         """Log-probabilities [N,COLUMNS,BINS] of pictures and their mirror images together."""
         own, other = self.ranges(torch.cat([image, image.flip(-1)]), self.compute_dtype).chunk(2)
-        return torch.logaddexp(own, other.flip(1)) - math.log(2)
+        return torch.logsumexp(torch.stack([own, other.flip(1)]), dim=0) - math.log(2)
 
     def latents(self, obs: Observation, starts: Tensor, state: RecurrentState | None = None,
                 goal_maps: Tensor | None = None) -> tuple[Latents, RecurrentState]:
@@ -223,12 +210,6 @@ def agreed(one: Recognition, other: Recognition) -> Recognition:
     return Recognition(*means)._replace(
         position=share * one.position + (1 - share) * other.position,
         heading=F.normalize(heading, dim=1, eps=1e-6))
-
-
-def heading_deviation(log_concentration: Tensor) -> Tensor:
-    """Circular standard deviation [rad] of von Mises distributions."""
-    kappa = log_concentration.exp()
-    return torch.sqrt(-2 * torch.log(torch.special.i1e(kappa) / torch.special.i0e(kappa)))
 
 
 def _no_actor() -> UserError:

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.pose_graph import between, compose
@@ -110,7 +109,7 @@ class Recall:
         self._tries = [TRIES] * len(self.goals)
         self._suggested: list[Hypothesis | None] = [None] * len(self.goals)
 
-    def look(self, searcher: Searcher, image: torch.Tensor) -> None:
+    def look(self, searcher: Searcher, image: np.ndarray) -> None:
         """Take in a picture [1,3,S,S], and tell the search what is known.
 
         Args:

@@ -24,8 +24,10 @@ class Rules:
     graze_m: float = 0.2
     backward_cost: float = 0.3  # m
     back_cost: float = 0.3  # m for turning back where the robot has just turned from
+    return_margin: float = 1.5  # decisions left, over those to its best guess: it turns back
     # What `bench/search.py` takes away, to measure what it adds.
     gathers: bool = True  # evidence over looks; else the newest vote alone counts
     refutes: bool = True  # hypotheses lose evidence where the goal is not recognised
     registers: bool = True  # the goal picture's ranges say where on the map it fits
     unsticks: bool = True  # a robot that is stuck passes obstacles closer
+    returns: bool = True  # back to the best guess in time, where the budget is known

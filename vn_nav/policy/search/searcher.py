@@ -15,11 +15,12 @@ from vn_nav.arrival import wrap_angle
 from vn_nav.measured_ranges import Scan
 from vn_nav.policy.search.approach import best_move
 from vn_nav.policy.search.costmap import ROOM, Costmap
-from vn_nav.policy.search.grid import OccupancyGrid
+from vn_nav.policy.search.grid import CELL, OccupancyGrid
 from vn_nav.policy.search.hypotheses import MISS_BELOW, Hypotheses, Hypothesis, apart
 from vn_nav.policy.search.lookahead import ENOUGH, best_turns, cost_at
 from vn_nav.policy.search.registration import Registration
 from vn_nav.policy.search.rules import Rules
+from vn_nav.policy.search.way import decisions_along, way_down
 
 # Decisions of exploring that show less new floor than this: where it leads there is none.
 IDLE, IDLE_M2 = 12, 0.5
@@ -58,6 +59,7 @@ class Searcher:
         grid, hypotheses: what it knows.
         registration: fits the goal picture to the map; None: nobody has seen it.
         arrival: probability that the robot has arrived, by the newest picture.
+        remaining: decisions that are left to it, the newest one included; None: nobody knows.
         aim: in a word, what it was about: 'follow', 'turn', 'explore', 'look' or 'lost'.
     """
 
@@ -81,6 +83,8 @@ class Searcher:
         self.pose = np.zeros(3)
         self.registration: Registration | None = None
         self.aim, self.arrival = 'look', 0.0
+        self.remaining: int | None = None
+        self._returns = False  # the budget is just enough for the best guess
         self.seen: Sight | None = None
         self._last = -1
         self._odometry: np.ndarray | None = None
@@ -93,7 +97,8 @@ class Searcher:
 
     def step(self, sight: Sight, last_action: int, odometry: np.ndarray | None,
              unmoved: bool = False, scan: Scan | None = None,
-             recall: Callable[[Searcher], None] | None = None) -> int:
+             recall: Callable[[Searcher], None] | None = None,
+             remaining: int | None = None) -> int:
         """The next action.
 
         Args:
@@ -104,6 +109,7 @@ class Searcher:
             scan: measured where the picture was taken: the map takes it in place of the ranges
                 that are seen.
             recall: brings to mind what is known of the place; called before the decision.
+            remaining: decisions that are left, this one included; None: nobody knows.
         """
         self._move(last_action, odometry, unmoved)
         self.grid.add_footprint(self.pose)
@@ -113,7 +119,7 @@ class Searcher:
             self.grid.add_scan(self.pose, scan, self.bearings)
         self.hypotheses.look(self.pose, sight.position, sight.sigma, sight.heading,
                              sight.co_visible)
-        self.arrival, self.seen = sight.arrived, sight
+        self.arrival, self.seen, self.remaining = sight.arrived, sight, remaining
         if recall is not None:
             recall(self)
         self._register()
@@ -128,6 +134,17 @@ class Searcher:
         for own in self.hypotheses.worth_trying(self.rules.follow_from)[:REGISTERED]:
             if not own.told:
                 own.pose = self.registration.fit(self.grid, own.voted, own.precision)
+
+    @property
+    def goal_estimate(self) -> np.ndarray | None:
+        """[3] x, y [m], yaw [rad] in the robot's frame of its best guess; None: there is none."""
+        guesses = self.hypotheses.worth_trying(self.rules.follow_from)
+        if not guesses:
+            return None
+        (dx, dy), yaw = guesses[0].pose[:2] - self.pose[:2], self.pose[2]
+        c, s = math.cos(yaw), math.sin(yaw)
+        return np.array([c * dx + s * dy, c * dy - s * dx,
+                         wrap_angle(float(guesses[0].pose[2] - yaw))])
 
     def reset_odometry(self) -> None:
         """The next odometry is in another frame: the nominal move counts until then."""
@@ -167,6 +184,9 @@ class Searcher:
             action = self._follow(own, costmap, here)
             if action is not None:
                 return action
+        action = self._return(costmap, here)
+        if action is not None:
+            return action
         # Where nothing is left to see, or the robot is stuck, it passes obstacles closer.
         self._watch()
         if not self._stuck_for:
@@ -213,6 +233,18 @@ class Searcher:
                     self.aim = 'approach'
                     return move
                 return self._doubt(own)
+        field = self._field_to(own, costmap, here)
+        if field is None:
+            return None
+        if own.is_stuck(float(field[here])):
+            self.hypotheses.refute(own)
+            return None
+        self.aim = 'follow'
+        return self._drive(field, costmap)
+
+    def _field_to(self, own: Hypothesis, costmap: Costmap, here: tuple[int, int]
+                  ) -> np.ndarray | None:
+        """Cost to go to where the robot can stand about a hypothesis; None: nowhere."""
         row, column = self.grid.cell(*own.pose[:2])
         reach = 5
         rows, columns = np.mgrid[row - reach:row + reach + 1, column - reach:column + reach + 1]
@@ -223,12 +255,33 @@ class Searcher:
         good = costmap.passable[cells[:, 0], cells[:, 1]] & (far <= reach)
         if not good.any():
             return None
-        field = costmap.cost_to_go(cells[good], 0.1 * 1.5 * far[good], here, through_unknown=True)
-        if own.is_stuck(float(field[here])):
-            self.hypotheses.refute(own)
+        return costmap.cost_to_go(cells[good], 0.1 * 1.5 * far[good], here, through_unknown=True)
+
+    def _return(self, costmap: Costmap, here: tuple[int, int]) -> int | None:
+        """Towards the best guess, however weak, while the budget is enough to look there.
+
+        None: there is time to explore, nobody knows the budget, or there is no guess left.
+        """
+        best = self.hypotheses.best(untried=True)
+        if not self.rules.returns or self.remaining is None or best is None:
+            self._returns = False
             return None
-        self.aim = 'follow'
-        return self._drive(field, costmap)
+        if not self._returns:
+            needed = self._decisions_to(best, costmap, here)
+            self._returns = self.remaining <= self.rules.return_margin * needed < math.inf
+        action = self._follow(best, costmap, here) if self._returns else None
+        # Behind a guess that is given up there may be time to explore again.
+        self._returns = action is not None
+        return action
+
+    def _decisions_to(self, own: Hypothesis, costmap: Costmap, here: tuple[int, int]) -> float:
+        """Decisions that the robot takes to look from where a hypothesis is; inf: no way."""
+        field = self._field_to(own, costmap, here)
+        if field is None or not np.isfinite(field[here]):
+            return math.inf
+        way = self.grid.origin + CELL * (way_down(field, here)[:, ::-1] + 0.5)
+        step = float(np.hypot(*self.moves[self._ahead, :2]))
+        return decisions_along(way, float(self.pose[2]), float(own.pose[2]), step, self._turn) + 1
 
     def _approach(self, own: Hypothesis, costmap: Costmap) -> tuple[int, float]:
         """The move that brings the robot onto a near hypothesis, and what that is worth."""
@@ -278,7 +331,8 @@ class Searcher:
             if np.isfinite(away) and (price[best] > 50 or away < price[best]):
                 if self._sees_nothing_new() or self._contacts >= IN_VAIN:
                     self._contacts = 0
-                    self.grid.give_up(_foot_of(field, here), ROOM)
+                    row, column = way_down(field, here)[-1]
+                    self.grid.give_up((int(row), int(column)), ROOM)
                 drive = self._drive(field, costmap)
         if drive is not None:
             self.aim = 'explore'
@@ -369,16 +423,3 @@ class Searcher:
         if left != right:
             return self._left if right else self._right
         return self._right if self._last == self._right else self._left
-
-
-def _foot_of(field: np.ndarray, here: tuple[int, int]) -> tuple[int, int]:
-    """The cell that the way from here ends at, downhill on the cost to go."""
-    row, column = here
-    for _ in range(field.size):
-        low, left = max(row - 1, 0), max(column - 1, 0)
-        part = field[low:row + 2, left:column + 2]
-        i, j = np.unravel_index(int(np.argmin(part)), part.shape)
-        if (low + i, left + j) == (row, column):
-            break
-        row, column = int(low + i), int(left + j)
-    return row, column

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from vn_msgs_py.motion import quaternion_to_yaw
+from vn_nav.bags.mapping.pose_graph import between
 from vn_nav.policy.search.grid import CELL
 from vn_nav.policy.search.searcher import Searcher
 
@@ -59,3 +62,27 @@ def _range(known: np.ndarray) -> slice:
     """From the first to the last true value; empty where there is none."""
     found = np.flatnonzero(known)
     return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 0)
+
+
+def snapshot_of(message: Any, guesses: Any, robot: np.ndarray) -> tuple[Snapshot, np.ndarray]:
+    """What a policy knew, out of its messages.
+
+    Args:
+        message: OccupancyGrid.
+        guesses: PoseArray; None: there is none.
+        robot: [3] x, y [m], yaw [rad] in the message's frame.
+
+    Returns:
+        A snapshot in a frame of its own, and where that lies in the message's, [3].
+    """
+    origin = _pose(message.info.origin)
+    cells = np.array(message.data, np.int8).reshape(message.info.height, message.info.width)
+    cells, corner = cut_to_known(cells, np.zeros(2), message.info.resolution)
+    poses = [] if guesses is None else [between(origin, _pose(pose)) for pose in guesses.poses]
+    return Snapshot(cells, corner, message.info.resolution, between(origin, robot),
+                    tuple(Guess(pose, math.nan) for pose in poses), '', math.nan), origin
+
+
+def _pose(message: Any) -> np.ndarray:
+    at, turn = message.position, message.orientation
+    return np.array([at.x, at.y, quaternion_to_yaw(turn.x, turn.y, turn.z, turn.w)])

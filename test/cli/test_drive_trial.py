@@ -1,0 +1,46 @@
+"""`vn_nav drive-trial` for real, small: both bases, over ROS, and what is counted of them."""
+
+import json
+import time
+
+import pytest
+from ros_harness import write_checkpoint
+
+from vn_nav.cli import main
+from vn_nav.evaluation.bag_episodes import drives_from_bag
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(240)]  # drives over ROS
+
+
+def test_both_bases_are_driven_once_and_counted_from_their_bags(tmp_path, capsys):
+    sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
+    words = ['drive-trial', '--out', str(tmp_path / 'out'), '--checkpoint', str(sure),
+             '--scene', 'house:7?rooms=2', '--episodes', '2', '--set', 'settle_time=0.2']
+    assert main(words) == 0
+    result = json.loads((tmp_path / 'out' / 'result.json').read_text())
+    assert list(result['bases']) == ['ideal', 'harsh'] and len(result['success_difference']) == 3
+    starts = []
+    for base, figures in result['bases'].items():
+        # It declares at the first picture, where it stands.
+        assert (figures['episodes'], figures['declared'], figures['false_stops'],
+                figures['decisions'], figures['good_stop_m']) == (2, 1, 1, 1, None)
+        (drive,) = drives_from_bag(tmp_path / 'out' / 'bags' / f'{base}-2027')
+        starts.append([one.facts['start'] for one in drive.episodes])
+        kept = json.loads((tmp_path / 'out' / f'{base}-2027.json').read_text())
+        assert ('settle_time' in kept['conditions']['policy']) == (base == 'harsh')
+    assert starts[0] == starts[1]
+    page = (tmp_path / 'out' / 'page.html').read_text()
+    assert page.count('<svg') == 2 and 'false stop' in page and '<script' not in page
+    begun = time.monotonic()
+    assert main(words) == 0
+    assert time.monotonic() - begun < 10, 'nothing is driven again'
+    assert '2 episodes of each base' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('words, what', [
+    (['--episodes', '0'], '--episodes'), (['--set', 'nonsense=1'], 'nonsense'),
+    (['--set', 'settle_time=long'], 'settle_time'), (['--set', 'settle_time=9'], 'settle_time')])
+def test_bad_options_are_one_line(tmp_path, capsys, words, what):
+    assert main(['drive-trial', '--out', str(tmp_path / 'out'), *words]) == 2
+    said = capsys.readouterr().err.strip()
+    assert what in said and '\n' not in said

@@ -1,0 +1,259 @@
+"""Experiments: their files, their commands, the runs and what stays of them."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vn_nav.cli.commands import build_parser
+from vn_nav.cli.commands import main as vn_nav
+from vn_nav.cli.train import train_config, world_options
+from vn_nav.errors import UserError
+from vn_nav.experiments.experiment import (
+    SIZES,
+    arguments,
+    experiment_names,
+    load_experiment,
+    slug,
+)
+from vn_nav.experiments.reproduction import Reproduction
+from vn_nav.report.curves import Run, reached, read_runs, thin
+from vn_nav.report.experiment_page import spread, write_results
+from vn_nav.robot import load_robot
+
+SMALL = """
+title: small
+question: does it run
+claim: nothing
+metric: length
+falls: true
+reach: [1000, 1]
+prepare:
+  - makes: "{files}/house.glb"
+    command: "house export --seed 3 --rooms 1 --out {files}/house.glb"
+train:
+  scene: "house:3?rooms=1"
+  preset: a2c
+  max_decisions: 12
+  set: {hidden: 16, features: 16, start_difficulty: 1.0}
+evaluate: {episodes: 4, max_decisions: 12}
+arms:
+  LSTM: {}
+  Frame stack: {set: {stacked_frames: 4}}
+sizes:
+  quick: {size: 84, frames: 1300}
+  full: {size: 174, frames: 1_000_000}
+"""
+
+
+def small(tmp_path: Path, text: str = SMALL) -> Path:
+    path = tmp_path / 'small.yaml'
+    path.write_text(text)
+    return path
+
+
+def reproduction(path: str | Path, tmp_path: Path, size: str = 'quick', **options) -> Reproduction:
+    return Reproduction(load_experiment(str(path)), size, tmp_path / 'runs', tmp_path / 'results',
+                        **options)
+
+
+def test_the_four_experiments_of_the_thesis_and_the_ablation_are_there():
+    assert experiment_names() == ['ablation', 'fig5.4', 'fig5.5', 'fig5.6', 'fig5.7']
+
+
+@pytest.mark.parametrize('size', SIZES)
+@pytest.mark.parametrize('name', experiment_names())
+def test_every_arm_is_a_training_that_the_command_line_takes(name, size, tmp_path):
+    own = reproduction(name, tmp_path, size)
+    parser = build_parser('train')
+    for arm in own.experiment.arms:
+        args = parser.parse_args(own.train_command(arm, 1))
+        config, world = train_config(args), world_options(args)
+        assert config.seed == 1 and config.threads == 1
+        assert config.frames == own.experiment.sizes[size]['frames']
+        assert args.size in (84, 174) and world['envs'] == 16  # table 5.1
+        assert '{' not in ' '.join(own.train_command(arm, 1))
+        if args.robot:
+            assert set(args.actions.split(',')) <= set(load_robot(args.robot).action_names)
+        evaluated = build_parser('evaluate').parse_args(own.evaluate_command(arm, 1))
+        assert evaluated.robot == args.robot
+
+
+def test_what_the_thesis_says_of_each_experiment():
+    def options(name, arm):
+        return train_config(build_parser('train').parse_args(
+            Reproduction(load_experiment(name), 'full', Path('a'), Path('b')).train_command(
+                arm, 0)))
+    memory, stack = options('fig5.4', 'LSTM'), options('fig5.4', 'frame stack')
+    assert (memory.stacked_frames, stack.stacked_frames) == (1, 4)
+    assert memory.architecture == stack.architecture == 'unreal'  # one picture, no goal
+    for config in (memory, stack):  # UNREAL's tasks in both
+        assert min(config.value_replay, config.pixel_control, config.reward_prediction) > 0
+    for name in ('fig5.4', 'fig5.5', 'fig5.6'):  # no curriculum
+        assert options(name, next(iter(load_experiment(name).arms))).start_difficulty == 1.0
+    ours, plain = options('fig5.7', 'A2CAT-VN'), options('fig5.7', 'UNREAL')
+    assert (ours.curriculum, ours.start_difficulty) == ('frames', 0.3)
+    assert ours.depth > 0 and ours.segmentation > 0 and ours.goal_segmentation > 0
+    assert plain.depth == plain.segmentation == plain.goal_segmentation == 0
+    assert options('fig5.5', 'ICRA 2017').scenes == len(
+        load_experiment('fig5.5').train['scene']) == 4
+    assert len(load_experiment('fig5.7').train['scene']) == 16
+
+
+def test_each_arm_of_the_ablation_has_one_task_more_than_none():
+    experiment = load_experiment('ablation')
+    parser = build_parser('train')
+    own = Reproduction(experiment, 'quick', Path('a'), Path('b'))
+    tasks = [set(train_config(parser.parse_args(own.train_command(arm, 0))).tasks)
+             for arm in experiment.arms]
+    assert tasks[0] == set() and all(len(one) == 1 for one in tasks[1:-1])
+    assert set().union(*tasks[1:-1]) == tasks[-1] and len(tasks[-1]) == len(tasks) - 2
+
+
+def test_options_become_a_command_line():
+    assert arguments({'scene': ['a:{files}/x', 'b:y'], 'max_decisions': 9, 'bf16': False,
+                      'overlap': True, 'channels': [1, 2, 3], 'set': {'depth': 0.1, 'x': True}},
+                     {'files': '/f'}) == [
+        '--scene', 'a:/f/x', '--scene', 'b:y', '--max-decisions', '9', '--no-bf16', '--overlap',
+        '--channels', '1', '2', '3', '--set', 'depth=0.1', '--set', 'x=true']
+    assert slug('ICRA 2017 (ours)') == 'icra-2017-ours'
+
+
+@pytest.mark.parametrize('change, named', [
+    (('title: small\n', ''), 'title'), (('metric: length', 'metric: [1]'), 'metric'),
+    (('reach: [1000, 1]', 'reach: [much]'), 'reach'), (('falls: true', 'falls: maybe'), 'falls'),
+    (('  full: {size: 174, frames: 1_000_000}\n', ''), 'sizes'), (('arms:', 'arm:'), 'arm'),
+    (('  LSTM: {}', '  LSTM: 3'), 'arms'), (('makes:', 'made:'), 'prepare'),
+])
+def test_a_file_that_is_no_experiment_is_refused(change, named, tmp_path):
+    with pytest.raises(UserError, match=named):
+        load_experiment(str(small(tmp_path, SMALL.replace(*change))))
+
+
+def test_bad_requests_are_one_line(tmp_path, capsys):
+    path = str(small(tmp_path))
+    for command in (['fig9.9'], [path, '--arms', 'GRU'], [path, '--seeds', '1', '1'],
+                    [path, '--jobs', '0'], [path, '--page']):
+        assert vn_nav(['reproduce', *command, '--out', str(tmp_path / 'runs')]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith('vn_nav: ') and said.count('\n') == 1
+
+
+@pytest.mark.slow
+def test_an_experiment_runs_from_files_to_page_and_is_not_repeated(tmp_path, capsys):
+    path, out = str(small(tmp_path)), tmp_path / 'runs'
+    assert vn_nav(['reproduce', path, '--out', str(out), '--seeds', '0', '1']) == 0
+    kept = out / 'results' / 'small-quick'
+    assert (out / 'small-quick' / 'files' / 'house.glb').exists()
+    runs = sorted(folder.name for folder in kept.iterdir() if folder.is_dir())
+    assert runs == ['frame-stack-seed0', 'frame-stack-seed1', 'lstm-seed0', 'lstm-seed1']
+    for name in runs:
+        run, = read_runs([kept / name], 'length')
+        assert run.columns['frames'][-1] >= 1300
+    result = json.loads((kept / 'figures.json').read_text())
+    assert list(result['arms']) == ['LSTM', 'Frame stack']
+    own = result['arms']['LSTM']
+    assert own['seeds'] == [0, 1] and all(own['reached']['1000'])
+    assert own['reached']['1'] == [None, None]
+    assert set(result['controls']) == {'random actions', 'shortest path'}
+    assert result['controls']['shortest path']['decisions'] <= 12
+    page, table = (kept / 'page.html').read_text(), (kept / 'table.md').read_text()
+    assert 'not within' in page and 'vn_nav train' in page and str(tmp_path) not in table
+    assert (kept / 'curves.png').stat().st_size > 5000
+
+    # On another machine, with only what stayed: nothing is run again; a missing run is.
+    shutil.rmtree(out / 'small-quick')
+    capsys.readouterr()
+    assert vn_nav(['reproduce', path, '--out', str(out), '--seeds', '0', '1']) == 0
+    assert 'begins' not in capsys.readouterr().out
+    shutil.rmtree(kept / 'lstm-seed1')
+    assert vn_nav(['reproduce', path, '--out', str(out), '--seeds', '0', '1', '--arms',
+                   'LSTM']) == 0
+    said = capsys.readouterr().out
+    assert 'lstm-seed1: begins' in said and 'lstm-seed0: begins' not in said
+
+
+@pytest.mark.slow
+def test_a_stopped_experiment_stops_its_runs_and_goes_on(tmp_path):
+    path = small(tmp_path, SMALL.replace('frames: 1300', 'frames: 20_000'))
+    command = [sys.executable, '-m', 'vn_nav.cli', 'reproduce', str(path), '--out',
+               str(tmp_path / 'runs'), '--seeds', '0', '--arms', 'LSTM']
+    state = tmp_path / 'runs' / 'small-quick' / 'lstm-seed0' / 'training_state'
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not state.exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    time.sleep(1.0)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=90)
+    log = state.parent.with_suffix('.log')
+    assert not _alive(str(state.parent)) and 'evaluate' not in log.read_text()
+    before = read_last_frames(state.parent)
+    assert before < 20_000
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert '--resume' in log.read_text() and read_last_frames(state.parent) >= 20_000
+
+
+def read_last_frames(folder: Path) -> float:
+    lines = (folder / 'metrics.csv').read_text().splitlines()
+    return float(lines[-1].split(',')[0]) if len(lines) > 1 else 0.0
+
+
+def _alive(text: str) -> bool:
+    """Whether a process runs whose command line has a text."""
+    for folder in Path('/proc').iterdir():
+        try:
+            if folder.name.isdigit() and int(folder.name) != os.getpid() and (
+                    text in (folder / 'cmdline').read_text()):
+                return True
+        except OSError:
+            continue
+    return False
+
+
+@pytest.mark.slow
+def test_a_command_that_fails_is_said_in_one_line(tmp_path, capsys):
+    path = small(tmp_path, SMALL.replace('hidden: 16', 'hidden: none'))
+    assert vn_nav(['reproduce', str(path), '--out', str(tmp_path / 'runs')]) == 2
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1 and 'exit code 2' in said and '.log' in said
+
+
+def test_a_value_is_reached_where_it_holds():
+    frames = np.arange(1, 101) * 100.0
+    length = np.where(frames < 5000, 300.0, 50.0)
+    length[9] = 40.0  # once, by luck
+    run = Run(Path('run'), 'run', {'frames': frames, 'minutes': frames / 100,
+                                   'tau': np.where(frames < 6000, 0.5, 1.0), 'length': length})
+    assert reached(run, 100, 'length', falls=True, in_curriculum=True) == (5000.0, 50.0)
+    assert reached(run, 100, 'length', falls=True) == (6000.0, 60.0)
+    assert reached(run, 45, 'length', falls=True) is None
+    assert reached(run, 200, 'length') is None  # no row at tau 1 is so high
+
+
+def test_a_thinned_curve_keeps_its_last_row(tmp_path):
+    rows = ['frames,minutes,tau,success', *(f'{k},{k},1,0.5' for k in range(1, 1002))]
+    (tmp_path / 'metrics.csv').write_text('\n'.join(rows) + '\n')
+    thin(tmp_path, tmp_path / 'kept')
+    run, = read_runs([tmp_path / 'kept'])
+    assert len(run.columns['frames']) <= 400 and run.columns['frames'][-1] == 1001
+
+
+def test_spread_is_not_of_some():
+    assert spread([1.0, 2.0], '.1f') == '1.5 (1.0-2.0)' and spread([0.5], '.0%') == '50 %'
+    assert spread([1.0, None], '.1f') == '-' and spread([], '.1f') == '-'
+
+
+def test_no_page_of_nothing(tmp_path):
+    own = reproduction(small(tmp_path), tmp_path)
+    assert write_results(own.experiment, 'quick', own.kept) is None
+    assert not own.kept.exists()

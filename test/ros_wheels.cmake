@@ -1,0 +1,18 @@
+# For -DCMAKE_PROJECT_INCLUDE, where ROS comes as wheels. Their message packages name the Python
+# headers of the machine that made the wheels, and CMake wants every folder that is named to exist.
+function(drop_missing_include_directories)
+  get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
+  foreach(target IN LISTS targets)
+    get_target_property(directories ${target} INTERFACE_INCLUDE_DIRECTORIES)
+    if(directories)
+      set(existing)
+      foreach(directory IN LISTS directories)
+        if(NOT IS_ABSOLUTE "${directory}" OR EXISTS "${directory}")
+          list(APPEND existing "${directory}")
+        endif()
+      endforeach()
+      set_target_properties(${target} PROPERTIES INTERFACE_INCLUDE_DIRECTORIES "${existing}")
+    endif()
+  endforeach()
+endfunction()
+cmake_language(DEFER CALL drop_missing_include_directories)

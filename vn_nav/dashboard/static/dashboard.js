@@ -1,0 +1,154 @@
+'use strict';
+const $ = (name) => document.getElementById(name);
+const KINDS = {1: 'camera', 2: 'goal', 3: 'map'};
+const LEVELS = ['ok', 'warn', 'error', 'error'];
+const OLD_MS = 3000;  // without word from the server
+let heard = 0, curve = [], ofGoal = null, bag = null, received = [];
+
+function say(text, good) {
+  $('said').textContent = text;
+  $('said').classList.toggle('good', Boolean(good));
+}
+
+async function ask(address, body) {
+  try {
+    const answer = await fetch(address, {method: 'POST', body});
+    const said = answer.ok ? await answer.json() : {done: false, message: await answer.text()};
+    say(said.message, said.done);
+  } catch (error) {
+    say(`The dashboard does not answer (${error.message}): use the robot's own stop.`);
+  }
+}
+
+function stop(event) {
+  if (event) event.preventDefault();
+  say('Stop asked for ...');
+  ask('stop');
+}
+
+function show(kind, blob) {
+  const image = $(KINDS[kind]), before = image.src;
+  image.src = URL.createObjectURL(blob);
+  image.hidden = false;
+  image.onload = () => { if (before) URL.revokeObjectURL(before); };
+  if (kind === 1) {
+    const now = performance.now();
+    received = [...received.filter((at) => now - at < 3000), now];
+  }
+}
+
+function draw() {
+  const last = Math.max(curve.length - 1, 1);
+  document.querySelector('#curve path').setAttribute('d', curve.map(
+    (p, k) => `${k ? 'L' : 'M'}${(400 * k) / last},${195 - 190 * p}`).join(''));
+}
+
+function tell(state) {
+  $('state').textContent = state.state;
+  $('reason').textContent = state.message;
+  $('light').className = LEVELS[state.level] || '';
+  $('reset').hidden = state.state !== 'stopped';
+  const goal = state.goal;
+  if (goal.number !== ofGoal) { ofGoal = goal.number; curve = []; }
+  $('goal_status').textContent = goal.status +
+    (goal.error_msg ? `: ${goal.error_msg}` : '');
+  if (goal.arrival !== null && goal.decisions > curve.length) {
+    while (curve.length < goal.decisions - 1) curve.push(curve.length ? curve.at(-1) : 0);
+    curve.push(goal.arrival);
+  }
+  draw();
+  $('arrival').textContent = goal.arrival === null ? '' : goal.arrival.toFixed(2);
+  $('distance').textContent = goal.distance === null ? '' : `goal ${goal.distance.toFixed(1)} m away`;
+  $('values').replaceChildren(...Object.entries(state.values).flatMap(([name, value]) => {
+    const [dt, dd] = ['dt', 'dd'].map((tag) => document.createElement(tag));
+    dt.textContent = name;
+    dd.textContent = value;
+    return [dt, dd];
+  }));
+}
+
+function connect() {
+  const socket = new WebSocket(`${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/live`);
+  socket.binaryType = 'arraybuffer';
+  socket.onmessage = ({data}) => {
+    heard = performance.now();
+    if (typeof data === 'string') { tell(JSON.parse(data)); return; }
+    const kind = new Uint8Array(data)[0];
+    show(kind, new Blob([data.slice(1)], {type: kind === 3 ? 'image/png' : 'image/jpeg'}));
+  };
+  socket.onclose = () => setTimeout(connect, 1000);
+}
+
+function watch() {
+  const now = performance.now();
+  received = received.filter((at) => now - at < 3000);
+  $('rate').textContent = received.length > 1 ? `${(received.length / 3).toFixed(1)} a second` : '';
+  if (heard && now - heard > OLD_MS) {
+    $('state').textContent = 'not connected';
+    $('reason').textContent = 'the dashboard is silent: what is shown is old';
+    $('light').className = 'error';
+  }
+}
+
+function choose(number) {
+  document.querySelectorAll('.chosen').forEach((node) => node.classList.remove('chosen'));
+  $('pictures').children[number].classList.add('chosen');
+  $('pictures').children[number].scrollIntoView({block: 'nearest'});
+  $('path').querySelectorAll('path')[number].classList.add('chosen');
+  ask(`goal/${number}`);
+}
+
+function showBag() {
+  const svg = $('path'), xs = bag.path.map((p) => p[0]), ys = bag.path.map((p) => -p[1]);
+  const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+  const margin = 0.8;
+  svg.setAttribute('viewBox', `${x0 - margin} ${y0 - margin} ${x1 - x0 + 2 * margin} ${y1 - y0 + 2 * margin}`);
+  const size = 0.035 * Math.max(x1 - x0, y1 - y0, 4);
+  const make = (tag, attributes) => {
+    const node = document.createElementNS('http://www.w3.org/2000/svg', tag);
+    Object.entries(attributes).forEach(([name, value]) => node.setAttribute(name, value));
+    return node;
+  };
+  svg.append(make('polyline', {points: bag.path.map((p) => `${p[0]},${-p[1]}`).join(' ')}));
+  bag.poses.forEach(([x, y, yaw]) => svg.append(make('path', {
+    d: `M${size},0 L${-0.6 * size},${0.6 * size} L${-0.6 * size},${-0.6 * size}Z`,
+    transform: `translate(${x} ${-y}) rotate(${(-180 * yaw) / Math.PI})`})));
+  svg.addEventListener('click', (event) => {
+    const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+    const away = bag.poses.map(([x, y]) => Math.hypot(x - at.x, -y - at.y));
+    choose(away.indexOf(Math.min(...away)));
+  });
+  bag.poses.forEach((_, number) => {
+    const button = document.createElement('button'), image = document.createElement('img');
+    image.src = `bag/${number}.jpg`;
+    image.loading = 'lazy';
+    image.alt = `picture ${number + 1}`;
+    button.append(image);
+    button.addEventListener('click', () => choose(number));
+    $('pictures').append(button);
+  });
+  $('bag_name').textContent = bag.name;
+  $('bag').hidden = false;
+}
+
+$('stop').addEventListener('click', stop);
+$('enable').addEventListener('click', () => ask('enable'));
+$('reset').addEventListener('click', () => ask('reset'));
+$('file').addEventListener('change', () => {
+  if ($('file').files.length) ask('goal', $('file').files[0]);
+  $('file').value = '';
+});
+// Whatever has the focus: the space bar must not press Enable again.
+document.addEventListener('keydown', (event) => {
+  if ((event.key === 'Escape' || event.key === ' ') && !event.repeat) stop(event);
+  else if (event.key === ' ') event.preventDefault();
+}, true);
+document.addEventListener('keyup', (event) => {
+  if (event.key === ' ') event.preventDefault();
+}, true);
+setInterval(watch, 500);
+connect();
+fetch('bag').then((answer) => answer.json()).then((found) => {
+  bag = found;
+  if (bag) showBag();
+});
