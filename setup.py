@@ -13,6 +13,7 @@ EXECUTABLES = {
     'goal_node': 'vn_nav.cli.nodes:goal_node',
     'policy_node': 'vn_nav.cli.nodes:policy_node',
     'recorder_node': 'vn_nav.cli.nodes:recorder_node',
+    'route_node': 'vn_nav.cli.nodes:route_node',
     'sim_bridge_node': 'vn_nav.cli.nodes:sim_bridge_node',
     'teleop_node': 'vn_nav.cli.nodes:teleop_node',
 }

@@ -12,6 +12,7 @@ import numpy as np
 from record_drive import RecordedDrive, bridge_parameters, read_drive, write_figures
 
 from vn_nav.arrival import arrived
+from vn_nav.bags.roles import Topics
 from vn_nav.cli.world import machine
 from vn_nav.errors import UserError
 from vn_nav.evaluation.bag_episodes import drives_from_bag
@@ -24,6 +25,9 @@ from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.report.tables import print_rows
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
+from vn_nav.routes.follower import SEEN, RouteFollower
+from vn_nav.routes.from_bag import pictures_along
+from vn_nav.routes.recognition import RouteEyes, Sighting
 from vn_nav.scenes import house_scene
 from vn_sim_bridge.houses.procedural import generate_house
 from vn_sim_bridge.houses.viewpoints import VIEW, interest
@@ -32,7 +36,8 @@ from vn_sim_bridge.robot.goal_pictures import GoalPicture, load_goal_pictures, s
 from vn_sim_bridge.robot.simulated_robot import TICK, TRUNCATED, SimulatedRobot
 from vn_sim_bridge.simulators.house import HouseSimulator
 
-BEFORE, AFTER, WRONG, RANDOM = ROWS = ('before', 'after', 'wrong picture', 'random actions')
+BEFORE, ROUTE, AFTER, WRONG, RANDOM = ROWS = (
+    'before', 'along the route', 'after', 'wrong picture', 'random actions')
 DRIVEN = ['odom', 'ground_truth/odom', 'cmd_vel', 'action', 'action_names', 'arrived', 'collision',
           'reward', 'episode_end', 'episode', 'episode_result', 'scene', '/diagnostics']
 RIGHT, OTHER = 'right', 'other'  # folders of goal pictures
@@ -53,13 +58,15 @@ def drive(options) -> dict[str, list[Episode]]:
     episodes = {}
     for row in options.rows:
         shown = folders[OTHER if row == WRONG else RIGHT]
-        checkpoint = options.checkpoint if row == BEFORE else out / 'taught' / 'checkpoint'
+        untaught = row in (BEFORE, ROUTE)
+        checkpoint = options.checkpoint if untaught else out / 'taught' / 'checkpoint'
         if row == RANDOM:
             episodes[row] = without_ros(options, None, [])
-        elif options.without_ros:
+        elif options.without_ros or row == ROUTE:
             policy = PolicyRuntime(checkpoint, seed=options.seed,
                                    stop_threshold=_threshold(options, checkpoint))
-            episodes[row] = without_ros(options, policy, load_goal_pictures(shown))
+            along = AlongRoute(policy, out / 'bag') if row == ROUTE else None
+            episodes[row] = without_ros(options, policy, load_goal_pictures(shown), along)
         else:
             episodes[row] = over_ros(options, row, checkpoint, shown)
         print_rows({options.stop: {row: summarise(episodes[row])}}, f'house {options.house}')
@@ -148,13 +155,67 @@ def _wait(processes: Processes, bridge: str, watch: Any, count: int) -> None:
     processes.check(bridge)
 
 
-def without_ros(options, policy: PolicyRuntime | None, pictures: list[GoalPicture]
-                ) -> list[Episode]:
+class AlongRoute:
+    """What `route_node` does, without ROS: goals are the pictures of a route most like them.
+
+    Args:
+        policy: that drives; bag: out of which the route is taken.
+    """
+
+    def __init__(self, policy: PolicyRuntime, bag: Path):
+        assert policy.search is not None  # it searches
+        self._policy = policy
+        along = [own.picture for own in pictures_along(bag, Topics())]
+        self._pictures = [preprocess(picture, policy.size) for picture in along]
+        self._eyes = RouteEyes(policy.search.eyes, np.stack(self._pictures))
+        self.count = len(along)
+
+    def set_out(self, goal: np.ndarray) -> None:
+        """Towards a goal picture [3,S,S], which is put at the end of what it is most like."""
+        seen = self._eyes.look(goal, np.arange(self.count))
+        own = np.where(seen.co_visible >= SEEN, seen.distance, np.inf)
+        self._target = int(own.argmin()) if np.isfinite(own).any() else int(
+            seen.co_visible.argmax())
+        self._follower, self._goal = RouteFollower(self.count, self._target), goal
+        self._begins, self._decisions = True, 0
+        self._policy.set_goal(goal)
+
+    def act(self, picture: np.ndarray, odometry: np.ndarray) -> int:
+        """The next action; the policy has arrived only where it is at the goal itself."""
+        def look(rows: np.ndarray) -> Sighting:
+            return self._eyes.look(picture, rows)
+
+        if self._begins:
+            self._begins = False
+            self._show(self._follower.begin(look))
+        action = self._policy.act(picture, odometry)
+        self._decisions += 1
+        estimate = self._policy.goal_estimate
+        distance = None if estimate is None else float(np.hypot(*estimate[:2]))
+        if self._policy.arrived:
+            if self._follower.shown == self._target:
+                return action
+            self._show(self._follower.arrived(look))
+            return self._policy.act(picture, odometry)
+        found = self._follower.decided(self._decisions, distance, look)
+        if found is not None:
+            self._show(found)
+            return self._policy.act(picture, odometry)
+        return action
+
+    def _show(self, number: int) -> None:
+        self._decisions = 0
+        self._policy.set_goal(self._goal if number == self._target else self._pictures[number])
+
+
+def without_ros(options, policy: PolicyRuntime | None, pictures: list[GoalPicture],
+                along: AlongRoute | None = None) -> list[Episode]:
     """The same starts and goals in the same robot, without ROS.
 
     Args:
         policy: None: random actions.
         pictures: shown, one for each goal.
+        along: drives the policy along a route.
     """
     spec = load_robot(options.out / 'robot.yaml').with_actions(DRIVE_ACTIONS)
     goals = load_goal_pictures(options.out / 'goals')
@@ -171,13 +232,15 @@ def without_ros(options, policy: PolicyRuntime | None, pictures: list[GoalPictur
         if policy is None:
             return int(rng.integers(len(deltas) + declares))
         picture = np.ascontiguousarray(robot.observe().rgb[0].transpose(1, 2, 0))
-        action = policy.act(preprocess(picture, policy.size), robot.odometry)
+        action = (policy if along is None else along).act(preprocess(picture, policy.size),
+                                                         robot.odometry)
         return len(deltas) if declares and policy.arrived else action
     found = []
     for index in range(options.episodes):
         episode, seconds, reached = robot.begin_episode(index), 0.0, False
         if policy is not None:
-            policy.set_goal(preprocess(pictures[episode.goal].picture, policy.size))
+            shown = preprocess(pictures[episode.goal].picture, policy.size)
+            policy.set_goal(shown) if along is None else along.set_out(shown)
         while True:
             action = choose()
             if action == len(deltas):

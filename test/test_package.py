@@ -14,7 +14,7 @@ import vn_nav
 from vn_sim_bridge.simulators import THOR
 
 COMMANDS = {'vn_nav', 'dashboard_node', 'goal_node', 'policy_node', 'recorder_node',
-            'sim_bridge_node', 'teleop_node'}
+            'route_node', 'sim_bridge_node', 'teleop_node'}
 
 
 @pytest.fixture

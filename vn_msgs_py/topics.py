@@ -18,7 +18,7 @@ class Topic:
 
     name: str
     type: str
-    publisher: str  # robot (or the bridge in its place), bridge, policy, user
+    publisher: str  # robot (or the bridge in its place), bridge, policy, route, user
     meaning: str
     reliability: str = RELIABLE
     durability: str = VOLATILE
@@ -69,6 +69,11 @@ TOPICS = (
     _latched('goal_status', _STRING, 'policy',
              'JSON: number of the goal; waiting, active, succeeded, failed or cancelled; error '
              'code and message (docs/nav2.md), decisions, seconds'),
+    Topic('route_goal', _STRING, 'user', 'where route_node drives: the name of a place, or the '
+          'number of a picture; empty: stop', depth=1),
+    _latched('route_status', _STRING, 'route',
+             'JSON: place, status (locating, active, succeeded, failed, cancelled), error '
+             'message, the pictures shown and nearest, names of places'),
     dataclasses.replace(Topic(
         'goal_feedback', _STRING, 'policy', 'JSON, at every decision: the same, the state, '
         'probability of arrival, estimated distance [m]'), debug=True),

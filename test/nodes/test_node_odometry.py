@@ -16,6 +16,7 @@ from std_msgs.msg import String
 
 from vn_msgs_py.images import fill_image
 from vn_msgs_py.motion import fill_odometry
+from vn_nav.nodes.camera_pictures import CameraPictures
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.decision_worker import DecisionWorker
 from vn_nav.nodes.policy_inputs import PolicyInputs
@@ -67,8 +68,9 @@ class Inside:
         self.output = CommandOutput(self.node, self.navigator, self.wake, period=0.05,
                                     lock_step=False, stamped=False)
         shadow = mode == 'shadow'
-        self.worker = DecisionWorker(self.node, self.navigator, self.runtime, self.output,
-                                     self.wake, lock_step=False, shadow=shadow)
+        self.worker = DecisionWorker(
+            self.node, self.navigator, self.runtime, CameraPictures(self.runtime), self.output,
+            self.wake, lock_step=False, shadow=shadow)
         self.inputs = PolicyInputs(self.node, self.navigator, self.worker, self.output, self.wake,
                                    compressed=False, lock_step=False, shadow=shadow)
         self.runs = True

@@ -17,7 +17,7 @@ from ros_harness import PATIENCE, ask, child, wait_until
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 NODES = {'goal_node': 'vn_nav.nodes.goal_node', 'policy_node': 'vn_nav.nodes.policy_node',
-         'recorder_node': 'vn_nav.nodes.recorder_node',
+         'recorder_node': 'vn_nav.nodes.recorder_node', 'route_node': 'vn_nav.nodes.route_node',
          'sim_bridge_node': 'vn_sim_bridge.bridge_node',
          'teleop_node': 'vn_nav.nodes.teleop_node'}
 ENDING = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT]
@@ -61,6 +61,7 @@ def test_help_is_printed_and_nothing_starts(name, tmp_path):
     ('recorder_node', ['-p', 'topics:=odom'], 'list'),
     ('teleop_node', ['-p', 'speed:=2.0'], 'between 0.05 and 1.0'),
     ('teleop_node', ['-p', 'source:=mouse'], 'auto, keyboard, joy'),
+    ('route_node', ['-p', 'place:=5'], 'in quotes'),
     ('recorder_node', ['-p', 'outptu:=x'], 'did you mean output?'),
     ('goal_node', ['-p', 'picture:=5'], 'text'),
     ('goal_node', ['-p', 'use_sim_time:=5'], 'use_sim_time'),

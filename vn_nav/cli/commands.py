@@ -29,6 +29,8 @@ COMMANDS = {
     'reproduce': 'run an experiment of the thesis again',
     'publish': 'measure a run and write it as a checkpoint to ship',
     'export': 'write a checkpoint as ONNX',
+    'route': 'take a route out of a bag, and name places on it',
+    'goal': 'drive to a place of a route, by its name',
     'doctor': 'check a live ROS 2 graph before a robot drives, and say what to type',
     'bag': 'check and repair recorded drives',
     'simulators': 'list the simulators, and what each can do',

@@ -33,6 +33,11 @@ def recorder_node() -> int:
     return _start('vn_nav.nodes.recorder_node')
 
 
+def route_node() -> int:
+    """Drive along a remembered route."""
+    return _start('vn_nav.nodes.route_node')
+
+
 def sim_bridge_node() -> int:
     """Simulate a robot in a house."""
     return _start('vn_sim_bridge.bridge_node')

@@ -13,21 +13,18 @@ import numpy as np
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Int8, String
 
-from vn_msgs_py import images
+from vn_nav.nodes.camera_pictures import CameraPictures, Prepared
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.goal_output import GoalOutput
 from vn_nav.nodes.prepared import prepared
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.range_input import NamedRanges, RangeInput
 from vn_nav.nodes.window import Window
-from vn_nav.observation import needed_side
 from vn_nav.policy.action_filter import NONE
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_record import Code, ProgressWatch
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.runtime import PolicyRuntime
-from vn_nav.policy.search.local_features import SIDE
-from vn_nav.policy.search.views import SIFT, View
 from vn_nav.rectification import Camera
 
 WINDOW_S = 5.0  # that rates and latencies are measured over
@@ -55,26 +52,26 @@ class DecisionWorker:
         node: that publishes `action`, `action_names` and `arrived`.
         navigator: wants the decisions.
         runtime: makes them; only the thread in `run` uses it.
+        pictures: what camera and goals show the policy.
         output: knows the odometry.
         wake: guards the navigator and what this object keeps.
         lock_step: frames stamped up to the goal's stamp belong to the episode before.
         shadow: decide only after `note_executed`, for a robot that somebody else drives.
         ranges: measured ranges for the map; None: it takes those that are seen in the pictures.
-        assumed_fov: of the shorter side [rad], of a camera that does not say; None: the policy's.
 
     Attributes:
-        camera: the robot's, as far as it is known.
+        pictures: as given.
         inferences: seconds that the decisions of the last while took.
         publishers: what `create_publisher` made.
         goal_output: says where the goal stands.
     """
 
     def __init__(self, node, navigator: Navigator, runtime: PolicyRuntime,
-                 output: CommandOutput, wake: threading.Condition, *, lock_step: bool,
-                 shadow: bool = False, ranges: RangeInput | None = None,
-                 assumed_fov: float | None = None):
+                 pictures: CameraPictures, output: CommandOutput, wake: threading.Condition, *,
+                 lock_step: bool, shadow: bool = False, ranges: RangeInput | None = None):
         self._node, self._navigator, self._runtime = node, navigator, runtime
-        self._output, self._wake, self._lock_step = output, wake, lock_step
+        self.pictures, self._output = pictures, output
+        self._wake, self._lock_step = wake, lock_step
         self._breaks = output.track.breaks  # of the odometry, that the runtime knows of
         self._shadow, self._ranges = shadow, ranges
         self._waits_from: float | None = None  # steady time [s]: pictures wait for ranges
@@ -85,8 +82,6 @@ class DecisionWorker:
             self._map = MapOutput(node, 0.0 if shadow and lock_step else PERIOD_S)
         self._executed: Executed | None = None
         self._shown: tuple | None = None  # the newest frame, also when the worker has taken it
-        self.camera: Camera | None = None
-        self._assumed_fov = assumed_fov
         # Of goal pictures that another camera took: the newest, and its stamp.
         self._goal_camera: tuple[tuple[int, int], Camera] | None = None
         self._frame: tuple | None = None  # the newest message, its stamp, when it came
@@ -147,16 +142,10 @@ class DecisionWorker:
                 self._frame = self._shown  # topics are not in order: the picture came first
             self._wake.notify_all()
 
-    @property
-    def camera_fov(self) -> float | None:
-        """Field of view of the camera's shorter side [rad], as far as it is known."""
-        camera = self.camera
-        return self._assumed_fov if camera is None else camera.fov
-
     def set_camera(self, camera: Camera) -> None:
         """What the camera says of itself. The goal was cut for what it said before."""
         with self._wake:
-            self.camera = camera
+            self.pictures.camera = camera
             self._take_goal_again()
 
     def set_goal_camera(self, stamp: tuple[int, int], camera: Camera) -> None:
@@ -179,11 +168,6 @@ class DecisionWorker:
             {} if self._runtime.action_filter == NONE else {
                 'filter_decisions': counts.decisions, 'filter_acted': counts.acted,
                 'filter_changed': counts.changed})
-
-    def check_fov(self) -> None:
-        """Raise UserError where the camera sees less than the policy needs."""
-        if self.camera_fov is not None:
-            self._runtime.check_camera(self.camera_fov, self._aspect)
 
     def publish_arrival(self, *, again: bool = False) -> None:
         """Publish whether the robot stands where the policy has arrived, when that changed.
@@ -236,7 +220,7 @@ class DecisionWorker:
         self.goal_output.publish()
 
     def _take_frame(self, message, stamp: float, received: float) -> None:
-        found = prepared(self._prepare, message, self._wake,
+        found = prepared(self.pictures.of, message, self._wake,
                          lambda why: self._navigator.bad_frame(why, time.monotonic()))
         if found is None:
             return
@@ -335,41 +319,9 @@ class DecisionWorker:
         self._waits_from = None
         return True
 
-    def _prepare(self, message) -> tuple[np.ndarray, float, View | None]:
-        """A picture for the policy, its zoom, and all of it where the policy verifies."""
-        camera, fov = self.camera, self.camera_fov
-        picture = self._decode(message, camera)
-        return self._show(picture if camera is None else camera.rectify(picture), fov)
-
-    def _prepare_goal(self, message: Image) -> tuple[np.ndarray, float, View | None]:
-        """As `_prepare`: cut or padded to what the robot's camera shows the policy."""
-        camera, fov, other = self.camera, self.camera_fov, self._goal_camera
-        if other is not None and other[0] == _stamp(message):
-            picture = other[1].rectify(self._decode(message, other[1]))
-            return self._show(picture, other[1].fov, self._runtime.zoom_of(fov, self._aspect))
-        picture = self._decode(message, camera)
-        if camera is not None and camera.fits(picture):
-            picture = camera.rectify(picture)
-        # Else it is of another camera, which nobody describes: as wide as the robot's.
-        return self._show(picture, fov)
-
-    @property
-    def _aspect(self) -> float:
-        """Width of the camera's pictures over their height."""
-        return 1.0 if self.camera is None else self.camera.aspect
-
-    def _decode(self, message, camera: Camera | None) -> np.ndarray:
-        size, target = self._runtime.size, self._runtime.camera_fov
-        smallest = (needed_side(size, self.camera_fov, target) if camera is None
-                    else camera.needed_side(size, target))
-        return images.decode_rgb(message, max(smallest, SIDE) if self._runtime.verify == SIFT
-                                 else smallest)
-
-    def _show(self, picture: np.ndarray, fov: float | None, zoom: float | None = None
-              ) -> tuple[np.ndarray, float, View | None]:
-        view = (View(picture, fov or self._runtime.camera_fov) if self._runtime.verify == SIFT
-                else None)
-        return *self._runtime.prepare(picture, fov, zoom), view
+    def _prepare_goal(self, message: Image) -> Prepared:
+        stamp, camera = self._goal_camera or (None, None)
+        return self.pictures.goal(message, camera if stamp == _stamp(message) else None)
 
 
 def _stamp(message) -> tuple[int, int]:

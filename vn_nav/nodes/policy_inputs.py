@@ -13,8 +13,6 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 
-from vn_nav.calibration import assumed_calibration, is_rectified, read_calibration
-from vn_nav.errors import UserError
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.decision_worker import WINDOW_S, DecisionWorker
 from vn_nav.nodes.qos import other_types, qos, subscribe
@@ -23,7 +21,6 @@ from vn_nav.nodes.window import Window
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import ENABLED, Navigator
-from vn_nav.rectification import Camera
 
 
 class PolicyInputs:
@@ -39,10 +36,6 @@ class PolicyInputs:
         lock_step: stamps are the simulator's ticks, and nothing is late.
         shadow: somebody else drives, and publishes what was done.
         ranges: measured ranges, for the diagnostics; None: there are none.
-        rectify: of `vn_nav.calibration.RECTIFY`: whether pictures are to be rectified by
-            camera_info.
-        target_fov: that the policy needs [rad].
-        assumed_fov: of a camera that is not calibrated [rad]; None: it is not driven by.
 
     Attributes:
         subscriptions: what was made.
@@ -52,8 +45,7 @@ class PolicyInputs:
 
     def __init__(self, node, navigator: Navigator, worker: DecisionWorker, output: CommandOutput,
                  wake: threading.Condition, *, compressed: bool, lock_step: bool, shadow: bool,
-                 ranges: RangeInput | None = None, rectify: str = 'auto',
-                 target_fov: float = 0.0, assumed_fov: float | None = None):
+                 ranges: RangeInput | None = None):
         self._node, self._navigator, self._worker, self._output = node, navigator, worker, output
         self._wake, self._lock_step, self._ranges = wake, lock_step, ranges
         self._goals = GoalWatch(trust_stamps=lock_step)
@@ -62,9 +54,7 @@ class PolicyInputs:
         self.subscriptions: list = []
         image, kind = (('image_raw/compressed', CompressedImage) if compressed else
                        ('image_raw', Image))
-        topic = self._subscribe(image, kind, self._on_image)
-        self._is_rectified = is_rectified(topic) if rectify == 'auto' else rectify == 'never'
-        self._target_fov, self._assumed_fov = target_fov, assumed_fov
+        self._subscribe(image, kind, self._on_image)
         self.camera_fault = ''
         self._subscribe('camera_info', CameraInfo, self._on_camera_info)
         self._subscribe('goal_image', Image, self._on_goal)
@@ -146,21 +136,13 @@ class PolicyInputs:
                 f'received {shorten(message.data)!r}: {shorten(repr(error))}')
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        known = self._worker.camera
         try:
-            calibration = read_calibration(message, rectified=self._is_rectified)
-            if calibration is None and self._assumed_fov is not None:
-                calibration = assumed_calibration(message, self._assumed_fov)
-            if calibration is None:
-                raise UserError('camera_info has the focal length of the camera',
-                                'zeros: it is not calibrated',
-                                'calibrate it (camera_calibration), or declare what it sees with '
-                                '-p camera_fov:=DEGREES')
-            if known is None or not known.calibration.is_near(calibration):
-                self._worker.set_camera(Camera(calibration, self._target_fov))
+            camera = self._worker.pictures.read_camera(message)
+            if camera is not None:
+                self._worker.set_camera(camera)
             self.camera_fault = ''
         except Exception as error:  # whatever somebody publishes there
-            if known is None:
+            if self._worker.pictures.camera is None:
                 self.camera_fault = shorten(str(error) or repr(error))
             self._node.get_logger().error(shorten(str(error) or repr(error)),
                                           throttle_duration_sec=10.0)
@@ -168,10 +150,9 @@ class PolicyInputs:
     def _on_goal_camera_info(self, message: CameraInfo) -> None:
         stamp = message.header.stamp
         try:
-            calibration = read_calibration(message)
-            if calibration is not None:
-                self._worker.set_goal_camera((stamp.sec, stamp.nanosec),
-                                             Camera(calibration, self._target_fov))
+            camera = self._worker.pictures.read_goal_camera(message)
+            if camera is not None:
+                self._worker.set_goal_camera((stamp.sec, stamp.nanosec), camera)
         except Exception as error:  # as above
             self._node.get_logger().error(
                 f'goal_camera_info refused: {shorten(str(error) or repr(error))}',

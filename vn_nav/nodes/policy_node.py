@@ -9,7 +9,6 @@ Run: `ros2 run vn_nav policy_node --ros-args -p checkpoint:=models/house`.
 
 from __future__ import annotations
 
-import math
 import sys
 import threading
 import time
@@ -22,6 +21,7 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from vn_nav.errors import UserError
 from vn_nav.measured_ranges import RangeSource
 from vn_nav.nodes import policy_parameters
+from vn_nav.nodes.camera_pictures import pictures_of
 from vn_nav.nodes.command_output import LOCK_STEP_SILENCE_S, TOPIC, CommandOutput
 from vn_nav.nodes.decision_worker import DecisionWorker
 from vn_nav.nodes.policy_inputs import PolicyInputs
@@ -133,16 +133,14 @@ class PolicyNode(LifecycleNode):
             patience=None if shadow else LOCK_STEP_SILENCE_S)
         self._ranges = RangeInput(self, self.navigator, self._output, self._wake, source,
                                   robot) if source else None
-        assumed_fov = math.radians(value['camera_fov']) or None
-        self._worker = DecisionWorker(self, self.navigator, runtime, self._output, self._wake,
-                                      lock_step=self.lock_step, shadow=shadow,
-                                      ranges=self._ranges, assumed_fov=assumed_fov)
+        compressed = value['image_transport'] == 'compressed'
+        self._worker = DecisionWorker(
+            self, self.navigator, runtime, pictures_of(self, runtime, value), self._output,
+            self._wake, lock_step=self.lock_step, shadow=shadow, ranges=self._ranges)
         self._require_odometry, self._shadow = value['require_odometry'], shadow
         self._inputs = PolicyInputs(self, self.navigator, self._worker, self._output, self._wake,
-                                    compressed=value['image_transport'] == 'compressed',
-                                    lock_step=self.lock_step, shadow=shadow,
-                                    ranges=self._ranges, rectify=value['rectify'],
-                                    target_fov=runtime.camera_fov, assumed_fov=assumed_fov)
+                                    compressed=compressed, lock_step=self.lock_step,
+                                    shadow=shadow, ranges=self._ranges)
         self._make_interfaces()
 
     def _make_interfaces(self) -> None:

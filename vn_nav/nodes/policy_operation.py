@@ -105,7 +105,7 @@ class Operation:
         if self._inputs.camera_fault:
             blockers.append(self._inputs.camera_fault)
         try:
-            self._worker.check_fov()
+            self._worker.pictures.check()
         except UserError as error:
             blockers.append(str(error))
         return self._navigator.enable(time.monotonic(), tuple(blockers))
@@ -163,8 +163,8 @@ class Operation:
             if state is State.IDLE and not self._node.is_running:
                 reason = 'the node is not active'
             fov, gate, broken = (
-                self._worker.camera_fov, self._navigator.gate, self._node.broken)
-            camera = self._worker.camera
+                self._worker.pictures.fov, self._navigator.gate, self._node.broken)
+            camera = self._worker.pictures.camera
             values = {'decisions': self._navigator.decisions, **self._worker.filter_values(),
                       **self._inputs.values(),
                       'camera_fov_deg': round(math.degrees(fov), 1) if fov else 'unknown',

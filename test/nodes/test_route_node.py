@@ -1,0 +1,208 @@
+"""Remembered routes for real: a recorded drive, then `vn_nav goal kitchen`, on ROS."""
+
+import contextlib
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import rclpy
+from fake_robot import FakeRobot
+from joystick_drive import drive, write_bag
+from nav_msgs.msg import Odometry
+from paths import ROOT
+from rclpy.executors import SingleThreadedExecutor
+from ros_harness import PATIENCE, child, wait_until, write_checkpoint
+from std_msgs.msg import String
+
+from vn_msgs_py.motion import odometry_to_array
+from vn_nav.arrival import wrap_angle
+from vn_nav.nodes.qos import qos
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(500)]
+HOUSE, ROOMS = 12_001, 3  # no training saw it
+NODE = 'vn_nav.nodes.route_node'
+ARRIVED_M, ARRIVED_RAD = 0.9, math.radians(40)  # the recorded picture is of a moving camera
+
+
+def command(*words, **options):
+    """`vn_nav` as a process."""
+    return subprocess.Popen([sys.executable, '-m', 'vn_nav.cli', *map(str, words)],
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+@pytest.fixture(scope='module')
+def way(tmp_path_factory):
+    """A route by `vn_nav route`, and the poses of its pictures."""
+    folder = tmp_path_factory.mktemp('drive')
+    poses, pictures = drive(60.0, rooms=ROOMS, house=HOUSE, size=84)
+    bag = write_bag(folder / 'bag', poses, pictures)
+    done = command('route', bag, '--out', folder / 'way')
+    assert done.wait(PATIENCE) == 0, done.stderr.read()
+    from vn_nav.bags.roles import Topics
+    from vn_nav.routes.from_bag import pictures_along
+    rows = [round(own.time / 0.2) for own in pictures_along(bag, Topics())]
+    return folder / 'way', poses[rows]
+
+
+class Watch:
+    """Hears what route_node says, and where the robot really is."""
+
+    def __init__(self):
+        rclpy.init()
+        self.node = rclpy.create_node('watch')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.pose, self.said = None, []
+        self.node.create_subscription(Odometry, 'ground_truth/odom', self._hear,
+                                      qos('ground_truth/odom'))
+        self.node.create_subscription(
+            String, 'route_status', lambda message: self.said.append(json.loads(message.data)),
+            qos('route_status', depth=100))
+
+    def _hear(self, message):
+        self.pose = odometry_to_array(message)[:3]
+
+    def spin(self):
+        self.executor.spin_once(timeout_sec=0.05)
+
+    def until(self, status):
+        wait_until(lambda: self.said and self.said[-1]['status'] == status, self.spin,
+                   what=f'{status}: {self.said[-3:]}')
+        return self.said[-1]
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+
+@contextlib.contextmanager
+def watching():
+    watch = Watch()
+    try:
+        yield watch
+    finally:
+        watch.close()
+
+
+def finish(process, watch, seconds=300):
+    """Wait for a command while the watch hears; code and what it printed."""
+    until = time.monotonic() + seconds
+    while process.poll() is None:
+        assert time.monotonic() < until, watch.said[-3:]
+        watch.spin()
+    return process.returncode, process.stdout.read(), process.stderr.read()
+
+
+def test_it_drives_to_places_by_their_names(way, tmp_path):
+    folder, poses = way
+    last = len(poses) - 1
+    named = command('route', folder, '--name', f'kitchen={last}', '--name', 'desk=0')
+    assert named.wait(PATIENCE) == 0
+    search = ROOT / 'models' / 'search'
+    with watching() as watch, \
+            child('vn_sim_bridge.bridge_node', tmp_path / 'bridge', house=HOUSE, rooms=ROOMS,
+                  time='lock_step', free_driving=True, noise=False), \
+            child('vn_nav.nodes.policy_node', tmp_path / 'policy', checkpoint=search,
+                  time='lock_step', use_sim_time=True), \
+            child(NODE, tmp_path / 'route', route=folder, checkpoint=search,
+                  use_sim_time=True) as node:
+        wait_until(lambda: watch.said, watch.spin)
+        code, said, _ = finish(command('goal'), watch)
+        assert code == 0 and said == 'places: kitchen, desk\n'
+        for place, number in (('kitchen', last), ('desk', 0)):
+            code, said, errors = finish(command('goal', place), watch)
+            shown = [one for one in watch.said if one['place'] == place]
+            assert code == 0, (said, errors, shown[-3:], (tmp_path / 'route').read_text())
+            assert f'arrived at {place}' in said and shown[-1]['shown'] == number
+            gap = np.hypot(*(watch.pose[:2] - poses[number, :2]))
+            turn = abs(wrap_angle(watch.pose[2] - poses[number, 2]))
+            assert gap < ARRIVED_M and turn < ARRIVED_RAD, (gap, math.degrees(turn))
+        # It went along the route, not straight for the goal alone.
+        assert max(one['pictures_shown'] for one in watch.said) > 1
+        code, _, errors = finish(command('goal', 'the moon'), watch)
+        assert code == 1 or 'kitchen' in errors
+        node.send_signal(signal.SIGINT)
+        assert node.wait(PATIENCE) == 0
+    for name in ('bridge', 'policy', 'route'):
+        assert 'Traceback' not in (tmp_path / name).read_text()
+
+
+def test_a_person_stops_it(way, tmp_path):
+    folder, _ = way
+    with watching() as watch, \
+            child('vn_sim_bridge.bridge_node', tmp_path / 'bridge', house=HOUSE, rooms=ROOMS,
+                  time='lock_step', free_driving=True), \
+            child('vn_nav.nodes.policy_node', tmp_path / 'policy', time='lock_step',
+                  checkpoint=ROOT / 'models' / 'search', use_sim_time=True, stop_threshold=1.0), \
+            child(NODE, tmp_path / 'route', route=folder, place="'0'", use_sim_time=True) as node:
+        watch.until('active')
+        # Another command takes it over; Ctrl-C there stops the robot.
+        driver = command('goal', len(way[1]) - 1)
+        wait_until(lambda: watch.said[-1]['place'] == str(len(way[1]) - 1)
+                   and watch.said[-1]['status'] == 'active', watch.spin)
+        driver.send_signal(signal.SIGINT)
+        code, said, _ = finish(driver, watch)
+        assert code == 130 and 'stopped' in said
+        watch.until('cancelled')
+        before = watch.pose.copy()
+        for _ in range(20):
+            watch.spin()
+        assert np.abs(watch.pose - before).max() < 0.3
+        # So does the end of route_node.
+        finish(command('goal', '0', '--no-wait'), watch)
+        watch.until('active')
+        node.send_signal(signal.SIGINT)
+        assert node.wait(PATIENCE) == 0
+        assert watch.until('cancelled')['error_msg'] == 'route_node ended'
+
+
+def test_what_fails_is_said(way, tmp_path):
+    """Without camera and policy, and with somebody else's goal."""
+    folder, _ = way
+    with watching() as watch:
+        with child(NODE, tmp_path / 'log', route=folder, place="'3'"):
+            assert 'no picture' in watch.until('failed')['error_msg']
+            code, _, errors = finish(command('goal', 'bath', '--no-wait'), watch)
+            assert code == 0, errors
+            wait_until(lambda: 'bath' in watch.said[-1]['error_msg'], watch.spin)
+        robot = FakeRobot()
+        sent = robot.node.create_publisher(String, 'route_goal', qos('route_goal'))
+        watch.said.clear()
+        try:
+            with child(NODE, tmp_path / 'other', route=folder):
+                wait_until(lambda: sent.get_subscription_count() and watch.said, watch.spin)
+                sent.publish(String(data='2'))
+
+                def spin():
+                    robot.spin()
+                    watch.executor.spin_once(timeout_sec=0)
+                wait_until(lambda: 'does not answer' in watch.said[-1]['error_msg'], spin)
+        finally:
+            robot.close()
+
+
+def test_without_a_route_node_the_command_says_what_to_start():
+    done = command('goal', 'kitchen', '--patience', '1', env=os.environ | {'ROS_DOMAIN_ID': '101'})
+    assert done.wait(PATIENCE) == 2
+    said = done.stderr.read().strip().splitlines()
+    assert len(said) == 1 and 'ros2 run vn_nav route_node' in said[0]
+
+
+@pytest.mark.parametrize('words, says', [
+    ({'route': '/nowhere'}, '/nowhere'), ({}, 'route:=FOLDER'), ({'place': 'bath'}, 'bath'),
+    ({'checkpoint': 'OTHER'}, 'searches')])
+def test_what_it_cannot_drive_is_one_line(way, tmp_path, words, says):
+    given = {'route': way[0]} | words if words else {}
+    if 'checkpoint' in words:
+        given['checkpoint'] = write_checkpoint(tmp_path / 'other')
+    with child(NODE, tmp_path / 'log', **given) as process:
+        assert process.wait(PATIENCE) == 2
+    lines = (tmp_path / 'log').read_text().strip().splitlines()
+    assert says in lines[-1] and 'Traceback' not in str(lines)

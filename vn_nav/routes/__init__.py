@@ -1,0 +1,1 @@
+"""Remembered routes: chains of pictures that a robot drives along."""
