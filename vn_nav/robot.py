@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from vn_nav.errors import UserError
@@ -116,8 +117,12 @@ class RobotSpec:
     max_angular: float = 0.8  # rad/s
     linear_acceleration: float = 0.5  # m/s^2
     angular_acceleration: float = 1.6  # rad/s^2
+    differential: bool = False  # it cannot move sideways: such actions of a policy are left out
 
     def __post_init__(self):
+        if not isinstance(self.differential, bool):
+            raise UserError('differential is true or false', reprlib.repr(self.differential),
+                            'correct the robot file')
         if not isinstance(self.name, str) or len(self.name) > NAME_LENGTH:
             raise UserError(f'the name of a robot is text of at most {NAME_LENGTH} characters',
                             reprlib.repr(self.name), 'correct the robot file')
@@ -141,18 +146,28 @@ class RobotSpec:
         """What each action does to the base: dx, dy [m], dyaw [rad]."""
         return tuple((action.dx, action.dy, action.dyaw) for action in self.actions)
 
+    @property
+    def impossible(self) -> tuple[int, ...]:
+        """Numbers of the actions that the base cannot do: sideways on a differential drive."""
+        return tuple(k for k, action in enumerate(self.actions)
+                     if self.differential and action.axis == 'dy' and action.size)
+
     def with_actions(self, names: tuple[str, ...] | list[str],
                      moves: tuple[tuple[float, float, float], ...] = ()) -> RobotSpec:
         """The same robot with only the named actions, in the given order.
 
         Args:
-            names: of the actions.
+            names: of the actions. Sideways ones need not be among those of a differential
+                robot: they become `impossible`.
             moves: dx, dy, dyaw that a policy expects of them; empty: it does not care.
 
         Raises:
-            UserError: a name that this robot does not have, or an action of another size.
+            UserError: a name that this robot does not have, or an action of another size; nothing
+                is left that it can do.
         """
         table = {action.name: action for action in self.actions}
+        if self.differential:
+            table = _sideways(names, moves) | table
         for name in names:
             if name not in table:
                 raise UserError(f'every action of the policy exists on robot {self.name!r}', name,
@@ -166,6 +181,9 @@ class RobotSpec:
                                 f'{expected} (m, m, rad)', f'{own} on robot {self.name!r}',
                                 'use a robot file with that action, or train a policy for this '
                                 'robot')
+        if len(chosen.impossible) == len(names):
+            raise UserError(f'robot {self.name!r} can do one of the actions at least', names,
+                            'use another checkpoint')
         return chosen
 
     def max_velocity(self, axis: str) -> float:
@@ -213,6 +231,16 @@ def load_robot(path: str | Path) -> RobotSpec:
                         f'the fields are {known}') from error
     except UserError as error:
         raise UserError(error.rule, f'{path}: {error.received}', error.remedy) from error
+
+
+def _sideways(names: Sequence[str], moves: Sequence[tuple[float, float, float]]
+              ) -> dict[str, Action]:
+    """Actions of a policy that move sideways, by what it says of them, or as the thesis's do."""
+    known = {action.name: action.dy for action in THESIS_ACTIONS}
+    if moves:
+        known = {name: dy for name, (dx, dy, dyaw) in zip(names, moves, strict=True)
+                 if not dx and not dyaw}
+    return {name: Action(name, dy=known[name]) for name in names if known.get(name)}
 
 
 def _is_mapping(value: object) -> bool:

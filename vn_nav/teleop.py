@@ -26,7 +26,7 @@ FIRST_HOLD_S, HOLD_S, REPEATS_S = 0.75, 0.2, 0.15
 
 def limits_of(robot: RobotSpec) -> np.ndarray:
     """[4] the fastest along each axis; 0: it has no action there."""
-    able = {action.axis for action in robot.actions}
+    able = {action.axis for k, action in enumerate(robot.actions) if k not in robot.impossible}
     return np.array([robot.max_velocity(axis) if axis in able else 0.0 for axis in AXES])
 
 

@@ -109,6 +109,10 @@ class PolicyNode(LifecycleNode):
                                 stop_threshold=None if threshold < 0 else threshold,
                                 verify=value['verify'], camera_pitch=robot.camera_pitch)
         robot = robot.with_actions(runtime.action_names, runtime.moves)
+        runtime.forbid(robot.impossible)
+        if robot.impossible:
+            names = ', '.join(robot.action_names[k] for k in robot.impossible)
+            self.get_logger().info(f'{robot.name} is a differential base: never {names}')
         source.check_policy(searches=runtime.search is not None)
         shadow = value['mode'] == 'shadow'
         if self.lock_step:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,8 @@ from vn_nav.policy.search.views import NONE, Pair, View, check_verify
 
 if TYPE_CHECKING:
     from vn_nav.policy.search.driver import SearchDriver
+
+NEVER = -1e9  # logit of an action that is left out
 
 
 class PolicyRuntime:
@@ -81,6 +84,7 @@ class PolicyRuntime:
         self._filter = make_filter(self.action_filter, self.moves, 1)
         self.search: SearchDriver | None = (None if backend.eyes is None
                                             else _driver(backend.eyes, camera_pitch))
+        self.forbid(())
         self.reset()
 
     def set_goal(self, goal: np.ndarray, view: View | None = None) -> None:
@@ -135,6 +139,13 @@ class PolicyRuntime:
             return 1.0
         zoom = zoom_of(fov_across(fov, aspect), self.camera_fov)
         return zoom if zoom > SAME_LENS else 1.0
+
+    def forbid(self, actions: Sequence[int]) -> None:
+        """Leave actions out: the base cannot do them (`RobotSpec.impossible`)."""
+        self._forbidden = np.isin(np.arange(len(self.action_names)), actions)
+        if self.search is not None:
+            for searcher in self.search.searchers:
+                searcher.forbid(self._forbidden)
 
     def reset(self) -> None:
         """Begin an episode: empty memory, no last action."""
@@ -216,7 +227,8 @@ class PolicyRuntime:
         offsets = None
         if self._filter is not None:
             offsets = self._filter.offsets(picture, last, last < 0)
-        action, acted, changed = self._backend.choose(said.logits, offsets, self.decoding)
+        logits = np.where(self._forbidden, np.float32(NEVER), said.logits)
+        action, acted, changed = self._backend.choose(logits, offsets, self.decoding)
         if said.arrival is not None:
             if not math.isfinite(said.arrival):
                 raise FloatingPointError('the arrival of the policy is not finite')

@@ -30,6 +30,7 @@ class SimulatedBase:
 
     def __init__(self, robot: RobotSpec, period: float):
         self._fastest = np.array([robot.max_velocity(axis) for axis in AXES])
+        self._fastest[AXES.index('dy')] *= not robot.differential
         self._step = np.array([robot.acceleration(axis) for axis in AXES]) * period
         self._period = period
         self._share = 1.0  # of a difference in speed that the motors make up in a period

@@ -68,6 +68,7 @@ class Searcher:
         self.moves = np.array(moves, float)
         self.bearings, self.edges, self.footprint = bearings, edges, footprint
         self.rules = rules or Rules()
+        self._forbidden = np.zeros(len(self.moves), bool)
         still = np.hypot(self.moves[:, 0], self.moves[:, 1]) < 1e-6
         self._left = int(np.argmax(np.where(still, self.moves[:, 2], -np.inf)))
         self._right = int(np.argmin(np.where(still, self.moves[:, 2], np.inf)))
@@ -75,6 +76,12 @@ class Searcher:
         self._drives = np.flatnonzero(~still)
         self._ahead = int(np.argmax(self.moves[:, 0]))
         self.reset()
+
+    def forbid(self, actions: np.ndarray) -> None:
+        """Never do these [A] bool: the base cannot."""
+        self._forbidden = actions
+        still = np.hypot(self.moves[:, 0], self.moves[:, 1]) < 1e-6
+        self._drives = np.flatnonzero(~still & ~actions)
 
     def reset(self) -> None:
         """Begin a search: an empty map about the robot."""
@@ -291,7 +298,7 @@ class Searcher:
         is_open = np.array([bool(s) or not self._is_blocked(angle)
                             for s, angle in zip(still, ways, strict=True)])
         is_open &= self._cut_off(costmap, ways, np.hypot(*self.moves[:, :2].T)) <= 0
-        is_open &= ~self._cannot_turn(self.moves[:, 2])
+        is_open &= ~self._cannot_turn(self.moves[:, 2]) & ~self._forbidden
         move, worth = best_move(costmap.passable, costmap.clearance, self.grid.origin, self.pose,
                                 own.pose, self.moves, self.rules.decision_price, is_open)
         return int(move), float(worth)
