@@ -120,21 +120,16 @@ class RouteFollower:
 
     def _further(self, look: Look) -> int:
         """The farthest picture on the way that is in view and in reach; at least the next one."""
-        if self.here is None:
+        if self.here is None or self.here == self.target:
             return self.target
         step = self._way(self.here)
-        if not step:
-            return self.target
-        ahead = np.arange(self.here + step, self.target + step, step)[:WINDOW]
+        ahead = np.arange(self.here + step, self.target + step, step)
         sighting = look(ahead)
-        best = self.here + step
-        for number, seen, distance in zip(ahead, sighting.co_visible, sighting.distance,
-                                          strict=True):
-            if seen < SEEN:
-                break  # what is seen behind that may be another place that looks alike
-            if distance <= REACH_M:
-                best = int(number)
-        return best
+        seen = sighting.co_visible >= SEEN
+        # One alone may be of another place that looks alike; the way may come back to this one.
+        beside = np.append(seen[1:], False) | np.insert(seen[:-1], 0, True)
+        found = np.flatnonzero(seen & beside & (sighting.distance <= REACH_M))
+        return int(ahead[found[-1] if len(found) else 0])
 
 
 def _nearest(rows: np.ndarray, sighting: Sighting) -> int | None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vn_nav.policy.search.eyes import Eyes
+from vn_nav.policy.search.eyes import Eyes, Seen, goal_places, likeness
 from vn_nav.policy.search.lens import pose_in_metres
 
 
@@ -15,6 +15,9 @@ class Sighting(NamedTuple):
 
     co_visible: np.ndarray  # [R] probability that they show what the robot sees
     distance: np.ndarray  # [R] m to where they were taken, if they do
+
+
+COMPARED = 64  # pictures at most; of more those that are most alike
 
 
 class RouteEyes:
@@ -29,10 +32,30 @@ class RouteEyes:
     def __init__(self, eyes: Eyes, pictures: np.ndarray, zoom: float = 1.0):
         self._eyes, self._zoom = eyes, zoom
         self._maps = eyes.encode_goals(pictures)
+        self._places: np.ndarray | None = None  # [K,P,C], see `goal_places`
+        self._newest: tuple[np.ndarray, Seen] | None = None
 
     def look(self, picture: np.ndarray, rows: np.ndarray) -> Sighting:
-        """Compare one picture [3,S,S] with those of these numbers [R]."""
-        features = self._eyes.see(picture[None]).features
-        said = self._eyes.compare(np.repeat(features, len(rows), axis=0), self._maps[rows])
+        """Compare one picture [3,S,S] with those of these numbers [R].
+
+        Of more than `COMPARED` the least alike are not compared: they are not in view.
+        """
+        if self._newest is None or self._newest[0] is not picture:
+            self._newest = picture, self._eyes.see(picture[None])
+        seen = self._newest[1]
+        chosen = np.arange(len(rows))
+        if len(rows) > COMPARED:
+            chosen = np.sort(np.argpartition(-self._likeness(seen, rows), COMPARED)[:COMPARED])
+        said = self._eyes.compare(np.repeat(seen.features, len(chosen), axis=0),
+                                  self._maps[rows[chosen]])
         position = pose_in_metres(*said[:4], self._zoom)[0]
-        return Sighting((1 + np.tanh(said.co_visible / 2)) / 2, np.hypot(*position.T))
+        found = Sighting(np.zeros(len(rows)), np.full(len(rows), np.inf))
+        found.co_visible[chosen] = (1 + np.tanh(said.co_visible / 2)) / 2
+        found.distance[chosen] = np.hypot(*position.T)
+        return found
+
+    def _likeness(self, seen: Seen, rows: np.ndarray) -> np.ndarray:
+        """How alike pictures [R] are to what is seen."""
+        if self._places is None:
+            self._places = goal_places(self._maps, seen.features.shape[2:])
+        return likeness(self._places[rows], seen.places[0])

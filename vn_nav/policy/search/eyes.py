@@ -81,3 +81,9 @@ def goal_places(goal_maps: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     down, across = (averages(side, POOLED) for side in shape[1:])
     mean = np.einsum('ph,gchw,qw->gpqc', down, maps, across).reshape(len(maps), -1, shape[0])
     return mean / np.maximum(np.linalg.norm(mean, axis=2, keepdims=True), 1e-12)
+
+
+def likeness(places: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """How alike pictures are to another one [K], by `goal_places` [K,P,C] and its [P,C]."""
+    alike = places @ seen.T  # [K,keys,query]
+    return alike.max(axis=1).mean(axis=1) + alike.max(axis=2).mean(axis=1)

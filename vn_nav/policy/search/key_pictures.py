@@ -10,7 +10,7 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.bags.mapping.pose_graph import between, compose
-from vn_nav.policy.search.eyes import Eyes, Placed, goal_places
+from vn_nav.policy.search.eyes import Eyes, Placed, goal_places, likeness
 from vn_nav.policy.search.lens import pose_in_metres
 from vn_nav.policy.search.taught import TaughtPlace
 
@@ -97,9 +97,7 @@ class KeyPictures:
             where there is none so close.
         """
         seen = self._eyes.see(image)
-        alike = self._places @ seen.places[0].T  # [K,keys,query]
-        score = alike.max(axis=1).mean(axis=1) + alike.max(axis=2).mean(axis=1)
-        rows = np.argsort(-score)[:ALIKE]
+        rows = np.argsort(-likeness(self._places, seen.places[0]))[:ALIKE]
         close = np.zeros(0, np.int64)
         if about is not None:
             off = np.hypot(np.hypot(*(self.poses[:, :2] - about[:2]).T) / VIEW_M,
