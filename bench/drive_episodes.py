@@ -64,7 +64,8 @@ def drive(options) -> dict[str, list[Episode]]:
             episodes[row] = without_ros(options, None, [])
         elif options.without_ros or row == ROUTE:
             policy = PolicyRuntime(checkpoint, seed=options.seed,
-                                   stop_threshold=_threshold(options, checkpoint))
+                                   stop_threshold=_threshold(options, checkpoint),
+                                   keep_map=row == ROUTE)
             along = AlongRoute(policy, out / 'bag') if row == ROUTE else None
             episodes[row] = without_ros(options, policy, load_goal_pictures(shown), along)
         else:
@@ -178,6 +179,7 @@ class AlongRoute:
             seen.co_visible.argmax())
         self._follower, self._goal = RouteFollower(self.count, self._target), goal
         self._begins, self._decisions = True, 0
+        self._policy.reset()  # the robot is elsewhere
         self._policy.set_goal(goal)
 
     def act(self, picture: np.ndarray, odometry: np.ndarray) -> int:

@@ -51,10 +51,12 @@ def run(args: argparse.Namespace) -> int:
                 raise UserError(f'{option} is positive', value, 'give another one')
         topics = load_topics(args.topics) if args.topics else Topics()
         route, along = write_route(args.source, args.out, topics, args.every, args.turn)
+    page = route.folder / 'route.html'
+    if not args.name or along:  # also where a name turns out to be none
+        write_file(page, route_page(route, along).encode())
     if names:
         route = with_places(route, names)
-    page = route.folder / 'route.html'
-    write_file(page, route_page(route, along).encode())
+        write_file(page, route_page(route, along).encode())
     way = f' along {along[-1][1]:.1f} m, {along[-1][0]:.0f} s' if along else ''
     print(f'{route.folder}: {len(route)} pictures{way}; places: {route.named()}')
     print(f'look at it: {page}')

@@ -107,7 +107,8 @@ class PolicyNode(LifecycleNode):
         runtime = PolicyRuntime(value['checkpoint'] or share_file('models/house'),
                                 seed=value['seed'], decoding=value['decoding'] or None,
                                 stop_threshold=None if threshold < 0 else threshold,
-                                verify=value['verify'], camera_pitch=robot.camera_pitch)
+                                verify=value['verify'], camera_pitch=robot.camera_pitch,
+                                keep_map=value['keep_map'])
         robot = robot.with_actions(runtime.action_names, runtime.moves)
         runtime.forbid(robot.impossible)
         if robot.impossible:

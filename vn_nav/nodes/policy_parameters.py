@@ -41,6 +41,8 @@ PARAMETERS = {
                              'so, 0 to 1 (1: never); -1: as the checkpoint says', (-1.0, 1.0)),
     'verify': (NONE, 'none, or sift: what a policy that searches sees of its goal is verified by '
                      'local features of the full pictures; for cameras, not simulators', VERIFY),
+    'keep_map': (False, 'a policy that searches keeps its map from goal to goal, by odometry; '
+                        'false: each goal begins with an empty one, as it was measured', None),
     'goal_decisions': (0, 'decisions for a goal, after which it has failed; a policy that '
                           'searches turns back to its best guess in time; 0: any number',
                        (0, 2**31 - 1)),

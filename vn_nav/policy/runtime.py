@@ -39,6 +39,8 @@ class PolicyRuntime:
         verify: 'sift': what a policy that searches sees of its goal is verified by local features
             of the full pictures, see `vn_nav.policy.search.verification`; 'none'.
         camera_pitch: down, of the camera [rad]; for `verify` alone.
+        keep_map: a policy that searches keeps its map from goal to goal, where odometry says how
+            the robot moves meanwhile; else each goal begins with an empty one, as it was measured.
 
     Attributes:
         size: side of the square pictures [pixels].
@@ -61,7 +63,8 @@ class PolicyRuntime:
 
     def __init__(self, folder: str | Path, *, seed: int = 0, decoding: str | None = None,
                  stop_threshold: float | None = None, verify: str = NONE,
-                 camera_pitch: float = 0.0):
+                 camera_pitch: float = 0.0, keep_map: bool = False):
+        self._keep_map = keep_map
         self._backend = backend = load_backend(Path(folder), seed)
         info, config = backend.info, backend.config
         self.decoding = info['decoding'] if decoding is None else decoding
@@ -99,7 +102,7 @@ class PolicyRuntime:
         if self.search is not None:
             self.search.prepare(self._goal_maps)
         self.arrival = math.nan
-        self.reset()
+        self._begin()
 
     def check_camera(self, fov: float, aspect: float) -> None:
         """Whether this policy can drive by a camera.
@@ -152,6 +155,14 @@ class PolicyRuntime:
         self._state = self._backend.initial_state()
         self._last_action = -1
         self._starts = True
+
+    def _begin(self) -> None:
+        """Begin an episode from where the robot is."""
+        begins = self._starts  # nothing has been mapped since `reset`
+        self.reset()
+        if self._keep_map and self.search is not None and not begins:
+            self._starts = False
+            self.search.new_goals()
 
     def correct(self, action: int) -> None:
         """Say what was really done since `act`, where another driver has control.
@@ -253,7 +264,7 @@ class PolicyRuntime:
         self.arrival = float(self.search.arrival[0])
         self._last_action, self._starts = action, False
         if self.arrived:
-            self.reset()
+            self._begin()
         return action
 
     def _checked(self, picture: np.ndarray) -> np.ndarray:

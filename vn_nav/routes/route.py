@@ -64,8 +64,8 @@ class Route:
             return len(self) - 1
         if number not in self.numbers:
             raise UserError('a place is one of the route, or the number of a picture',
-                            repr(place[:60]), f'the places are {self.named()}; the pictures '
-                            f'{self.numbers[0]} to {self.numbers[-1]}')
+                            repr(place[:60]), f'places of {self.folder}: {self.named()}; '
+                            f'pictures: {self.numbers[0]} to {self.numbers[-1]}')
         return self.numbers.index(number)
 
     def name(self, index: int) -> str:
@@ -75,7 +75,7 @@ class Route:
 
     def named(self) -> str:
         """The names, for people."""
-        return ', '.join(self.places) or 'without names'
+        return ', '.join(self.places) or 'none has a name'
 
     def picture(self, index: int):
         """A picture [H,W,3] uint8 RGB, and the field of view of its shorter side [rad] or None.

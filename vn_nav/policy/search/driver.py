@@ -62,6 +62,7 @@ class SearchDriver:
         self.arrival = np.full(num_envs, np.nan, np.float32)
         self._before: np.ndarray | None = None
         self.max_decisions = max_decisions
+        self._renewed = np.zeros(num_envs, bool)  # another goal, and the map stays
         self._decided = np.zeros(num_envs, np.int64)  # in these episodes
         self._compile(Searcher(config.moves, bearings, RANGE_EDGES, config.footprint))
 
@@ -84,6 +85,13 @@ class SearchDriver:
         """Look for a goal [1,...] in the taught place now, so that the first `act` need not."""
         if self._keys is not None:
             self._goal = goal_maps, self._keys.poses_of_goal(goal_maps)
+
+    def new_goals(self) -> None:
+        """The next pictures begin searches for other goals, with the maps as they are.
+
+        A robot without odometry begins an empty map: its last action may have been cut off.
+        """
+        self._renewed[:] = True
 
     def _poses_of_goal(self, keys: KeyPictures, goal_maps: np.ndarray) -> list[Mode]:
         if self._goal is not None and np.array_equal(goal_maps, self._goal[0]):
@@ -121,9 +129,11 @@ class SearchDriver:
         self._before = small
         actions = np.empty(len(image), np.int64)
         for n, (searcher, sight) in enumerate(zip(self.searchers, sights, strict=True)):
-            if starts[n]:
-                searcher.reset()
-                self._decided[n] = 0
+            begins = bool(starts[n] or self._renewed[n])
+            if begins:
+                keeps = self._renewed[n] and not starts[n] and odometry is not None
+                searcher.new_goal() if keeps else searcher.reset()
+                self._renewed[n], self._decided[n] = False, 0
                 ranges = ranges_in_metres(goal_ranges(goal_maps[n:n + 1]), self._bearings, zoom)
                 searcher.registration = Registration(bearings, np.exp(ranges[0]))
             pair = None if pairs is None else pairs[n]
@@ -134,13 +144,14 @@ class SearchDriver:
             if self.recalls is not None and self._keys is not None and (
                     abs(zoom / self.recalls[n].place.zoom[0] - 1) < SAME):
                 own = self.recalls[n]
-                if starts[n]:
-                    own.begin(self._poses_of_goal(self._keys, goal_maps[n:n + 1]))
+                if begins:
+                    (own.new_goals if keeps else own.begin)(
+                        self._poses_of_goal(self._keys, goal_maps[n:n + 1]))
                 recall = functools.partial(own.look, image=image[n:n + 1])
             searcher.bearings = bearings
-            actions[n] = searcher.step(sight, -1 if starts[n] else int(last_action[n]),
+            actions[n] = searcher.step(sight, -1 if begins else int(last_action[n]),
                                        None if odometry is None else odometry[n],
-                                       unmoved=bool(still[n]) and not starts[n],
+                                       unmoved=bool(still[n]) and not begins,
                                        scan=None if scans is None else scans[n], recall=recall,
                                        remaining=None if self.max_decisions is None else
                                        self.max_decisions - int(self._decided[n]))

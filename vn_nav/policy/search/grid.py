@@ -131,11 +131,15 @@ class OccupancyGrid:
         return np.array([_expect(unknown, obstacles, self.missed, self.origin, pose[0],
                                  pose[1], heading + bearings, False) for heading in headings])
 
-    def forget_looks(self) -> None:
-        """Let everything be looked at again; own obstacles and free floor stay, no prior."""
+    def forget_looks(self, prior: bool = False) -> None:
+        """Let everything be looked at again; obstacles and free floor stay.
+
+        Args:
+            prior: whether what the prior has seen counts as seen.
+        """
         self.seen *= 0.2
         self.missed[:] = 0
-        self._prior_counts = False
+        self._prior_counts = prior
 
     def known_area(self) -> float:
         """Floor that was seen [m^2]."""

@@ -98,14 +98,18 @@ class Recall:
     def begin(self, goals: Sequence[Mode]) -> None:
         """Begin a search, anywhere in the place or elsewhere."""
         self.localiser = Localiser()
+        self._pose: np.ndarray | None = None
+        self._frame: np.ndarray | None = None  # of the drive on the robot's map, last believed
+        self.new_goals(goals)
+
+    def new_goals(self, goals: Sequence[Mode]) -> None:
+        """Search for something else, from where the robot is."""
         self.goals: list[Mode] = []
         for goal in goals[:GOALS]:
             gaps = [apart(goal.pose, own.pose) for own in self.goals]
             if goal.share >= GOAL_SHARE and not any(
                     gap < MERGE_M and turn < MERGE_RAD for gap, turn in gaps):
                 self.goals.append(goal)  # nearer ones would be one hypothesis
-        self._pose: np.ndarray | None = None
-        self._frame: np.ndarray | None = None  # of the drive on the robot's map, last believed
         self._tries = [TRIES] * len(self.goals)
         self._suggested: list[Hypothesis | None] = [None] * len(self.goals)
 

@@ -86,18 +86,23 @@ class Searcher:
     def reset(self) -> None:
         """Begin a search: an empty map about the robot."""
         self.grid = OccupancyGrid(self.footprint)
-        self.hypotheses = Hypotheses(self.rules.gathers, self.rules.refutes)
         self.pose = np.zeros(3)
+        self._odometry: np.ndarray | None = None
+        self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
+        self._unturned: list[tuple[np.ndarray, int]] = []  # [3] poses, and where it could not turn
+        self.new_goal()
+
+    def new_goal(self) -> None:
+        """Search for another goal, from where the robot is on its map."""
+        self.grid.forget_looks(prior=True)
+        self.hypotheses = Hypotheses(self.rules.gathers, self.rules.refutes)
         self.registration: Registration | None = None
         self.aim, self.arrival = 'look', 0.0
         self.remaining: int | None = None
         self._returns = False  # the budget is just enough for the best guess
         self.seen: Sight | None = None
         self._last = -1
-        self._odometry: np.ndarray | None = None
         self._known: list[float] = []  # m^2, at the decisions of exploring
-        self._blocked: list[np.ndarray] = []  # [3] places and directions of contacts
-        self._unturned: list[tuple[np.ndarray, int]] = []  # [3] poses, and where it could not turn
         self._track: list[tuple[float, float, float]] = []  # x, y [m], m^2 known: the last ones
         self._contacts = 0.0  # of late, while it explored
         self._decisions, self._forgot, self._stuck_for = 0, -FORGET_EVERY, 0
