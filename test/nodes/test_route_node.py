@@ -110,7 +110,7 @@ def test_it_drives_to_places_by_their_names(way, tmp_path):
             child('vn_sim_bridge.bridge_node', tmp_path / 'bridge', house=HOUSE, rooms=ROOMS,
                   time='lock_step', free_driving=True, noise=False), \
             child('vn_nav.nodes.policy_node', tmp_path / 'policy', checkpoint=search,
-                  time='lock_step', use_sim_time=True), \
+                  time='lock_step', use_sim_time=True, keep_map=True), \
             child(NODE, tmp_path / 'route', route=folder, checkpoint=search,
                   use_sim_time=True) as node:
         wait_until(lambda: watch.said, watch.spin)
