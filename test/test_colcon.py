@@ -70,7 +70,7 @@ def test_nodes_start_from_the_installation(workspace, tmp_path):
                 time.sleep(1.0)
                 assert process.poll() is None, f'{name} ended: {log.read_text()}'
                 process.send_signal(signal.SIGINT)
-                assert process.wait(timeout=30) == 0, log.read_text()
+                assert process.wait(timeout=100) == 0, log.read_text()
             finally:
                 process.kill()
                 process.wait()

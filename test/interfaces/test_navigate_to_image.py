@@ -129,7 +129,7 @@ def results(robot, environment, goals):
                               text=True)
     try:
         wait_until(lambda: client.poll() is not None, robot.spin, 300)
-        said, error = client.communicate(timeout=10)
+        said, error = client.communicate(timeout=60)
     finally:
         client.kill()
     assert client.returncode == 0, error

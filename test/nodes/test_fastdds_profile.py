@@ -71,7 +71,7 @@ def test_vga_pictures_arrive(profile):
                 [sys.executable, '-c', source.format(frames=FRAMES, rate=RATE)],
                 env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         output, errors = processes[0].communicate(timeout=60)
-        _, publisher_errors = processes[1].communicate(timeout=20)
+        _, publisher_errors = processes[1].communicate(timeout=60)
     finally:
         for process in processes:
             process.kill()

@@ -277,7 +277,7 @@ print('ended' if ended.is_set() else 'never')
         while time.monotonic() < until:
             process.send_signal(signal.SIGINT)
             time.sleep(0.0003)
-        output, errors = process.communicate(timeout=20)
+        output, errors = process.communicate(timeout=100)
     finally:
         process.kill()
     assert (output, process.returncode) == ('ended\n', 0), errors[-500:]

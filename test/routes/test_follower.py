@@ -134,6 +134,22 @@ def test_a_picture_takes_so_many_decisions_at_most_but_the_target_any_number():
     assert follower.decided(10 * MOST_DECISIONS, 1.5, corridor.look) is None
 
 
+def test_a_way_that_gets_nowhere_ends_in_a_search_for_the_target():
+    corridor = Corridor()
+    follower = RouteFollower(40, 39)
+    follower.begin(corridor.look)
+    shown = [follower.shown]
+    # It is carried to and fro: what it is shown is never reached, and never long enough to fail.
+    for k in range(300):
+        corridor.robot = 3.0 * (k // 4 % 2)
+        found = follower.decided(1 + k % 4, None if k % 4 == 3 else 2.0, corridor.look)
+        if found is not None:
+            shown.append(found)
+    assert shown[-1] == 39 and follower.shown == 39
+    assert follower.decided(1000, 2.0, corridor.look) is None
+    assert follower.failed(corridor.look) is None
+
+
 def test_without_an_idea_of_the_goal_it_finds_itself_anew():
     corridor = Corridor()
     shown = corridor.drive(RouteFollower(40, 39), blind=True)

@@ -49,8 +49,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _wait(client, place: str) -> int:
     shown: tuple = ()
+    begun = False
     while True:
         status = client.next_status()
+        begun = begun or status['status'] in ('locating', 'failed')
+        if not begun:
+            continue  # the way before
         now = status['shown'], status['here']
         if status['status'] == 'succeeded':
             print(f'arrived at {place}')

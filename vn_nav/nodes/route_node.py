@@ -39,6 +39,7 @@ _SHARED = ('image_transport', 'rectify', 'camera_fov')
 PARAMETERS = {
     'route': ('', 'folder of numbered pictures, of `vn_nav route` or a topomap of ViNT or NoMaD'),
     'place': ('', 'where to drive at once: a name or the number of a picture; empty: nowhere'),
+    'max_decisions': (1000, 'of a way, after which it has failed; 0: any number', (0, 2**31 - 1)),
     'checkpoint': ('', 'of a policy that searches, as policy_node has it; empty: models/search'),
     'policy': ('policy_node', "name of the policy's node"),
     **{name: policy_parameters.PARAMETERS[name] for name in _SHARED},
@@ -82,6 +83,7 @@ class RouteNode(Node):
             raise UserError('a route is driven along by the eyes of a policy that searches',
                             f'{value["checkpoint"]}, which does not search',
                             'give checkpoint:=models/search, here and to policy_node')
+        self._most, self._decisions = value['max_decisions'], 0
         self._pictures = pictures_of(self, self._runtime, value)
         self._eyes: RouteEyes | None = None  # of the camera as it is known
         self._camera: Any = None  # message: the newest picture
@@ -90,7 +92,7 @@ class RouteNode(Node):
         self._target = -1
         self._status, self._message, self._said = RouteStatus.NONE, '', ''
         self._since = 0.0  # steady time of this status, or of the newest picture shown [s]
-        self._number = 0  # of policy_node's newest goal
+        self._number: int | None = None  # of policy_node's newest goal; None: it said nothing yet
         self._ours: int | None = None  # of the picture shown
         self._enables: ServiceCall | None = None
         self._goals = GoalPublisher(self)
@@ -135,8 +137,8 @@ class RouteNode(Node):
         before, self._number = self._number, said['goal']
         if self._status is not RouteStatus.ACTIVE:
             return
-        if said['goal'] < before:
-            self._end(RouteStatus.FAILED, 'policy_node began anew')
+        if before is not None and said['goal'] < before:
+            self._cancel('policy_node began anew', RouteStatus.FAILED)
         elif self._ours is not None and said['goal'] > self._ours:
             self._end(RouteStatus.CANCELLED, 'another goal came')
         elif said['goal'] == self._ours:
@@ -147,6 +149,8 @@ class RouteNode(Node):
         assert self._follower is not None  # there is a way
         if said['status'] == 'active':
             self._enables = None
+        elif said['status'] == 'waiting' and self._enables is None:
+            self._end(RouteStatus.CANCELLED, 'motion was disabled')
         elif said['status'] == 'succeeded' and self._follower.shown == self._target:
             self._end(RouteStatus.SUCCEEDED)
         elif said['status'] == 'succeeded':
@@ -161,6 +165,10 @@ class RouteNode(Node):
         if self._status is RouteStatus.ACTIVE and said['goal'] == self._ours and (
                 said['status'] == 'active' and self._follower is not None):
             follower = self._follower
+            self._decisions += 1
+            if 0 < self._most <= self._decisions:
+                self._cancel(f'{self._decisions} decisions are used up', RouteStatus.FAILED)
+                return
             found = self._seeing(lambda look: follower.decided(
                 said['decisions'], said['distance_remaining'], look))
             if found is not None:
@@ -174,27 +182,27 @@ class RouteNode(Node):
         try:
             target = self._route.index(place)
         except UserError as error:
-            if self._status in UNDER_WAY:
-                self.get_logger().error(str(error))
-            else:
-                self._end(RouteStatus.FAILED, str(error))
+            self.get_logger().error(str(error))
+            self._cancel(str(error), RouteStatus.FAILED)
             return
         self._target, self._follower, self._ours = target, RouteFollower(
             len(self._route), target), None
+        self._decisions = 0
         self._status, self._message, self._since = RouteStatus.LOCATING, '', time.monotonic()
         self._say()
 
     def _tend(self) -> None:
-        """Begin once there is a picture; enable motion."""
+        """Begin once there is a picture; enable motion, once: later a person may disable it."""
         now = time.monotonic()
         late = now - self._since > PATIENCE_S
         if self._status is RouteStatus.LOCATING:
-            if self._camera_at > self._since:
+            if self._camera_at > self._since and self._number is not None:
                 assert self._follower is not None  # it has set out
-                self._status = RouteStatus.ACTIVE
+                self._status, self._enables = RouteStatus.ACTIVE, self._allow()
                 self._go_on(self._follower.begin)
             elif late:
-                self._end(RouteStatus.FAILED, f'no picture of the camera for {PATIENCE_S:g} s')
+                self._end(RouteStatus.FAILED, 'no goal_status of policy_node'
+                          if self._number is None else 'no picture of the camera')
         elif self._status is RouteStatus.ACTIVE and self._enables is not None:
             answered = self._enable.service_is_ready() and self._enables.is_answered()
             if answered and not self._enables.answer.success:
@@ -244,14 +252,15 @@ class RouteNode(Node):
 
     def _show(self, index: int) -> None:
         """Show policy_node a picture of the route."""
+        assert self._number is not None  # waited for
         self._ours, self._since, self._message = self._number + 1, time.monotonic(), ''
         self._goals.show(*self._files[index])
-        self._enables = self._allow()
 
     def _cancel(self, why: str, status: RouteStatus = RouteStatus.CANCELLED) -> None:
-        """End a way, and have the robot stand still."""
+        """End a way, if there is one, and have the robot stand still."""
+        drives = self._status in UNDER_WAY
         self._end(status, why)
-        if self._enable.service_is_ready():
+        if drives and self._enable.service_is_ready():
             self._enable.call_async(SetBool.Request(data=False))
 
     def _end(self, status: RouteStatus, message: str = '') -> None:

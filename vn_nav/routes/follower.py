@@ -23,6 +23,7 @@ REACH_M = 3.0  # a picture farther away is no goal yet
 PASS_M = 0.8  # so near a picture the next one is shown
 LOOK_EVERY = 4  # decisions, while it has no idea where its goal is
 MOST_DECISIONS = 60  # for one picture
+PATIENCE = 80  # decisions in which it has to be shown a picture nearer to the target
 TRIES = 3  # pictures in a row that it does not reach, before it is shown the last one
 
 
@@ -46,6 +47,9 @@ class RouteFollower:
         self.passed = -1
         self._failures = 0
         self._since = 0  # decisions for the picture shown, when it last looked
+        self._left = count  # pictures from the one shown to the target, at least so far
+        self._waited = 0  # decisions since it has become less
+        self._searches = False  # for the target, whatever it sees of the route
 
     def begin(self, look: Look) -> int:
         """The first picture to show."""
@@ -59,7 +63,12 @@ class RouteFollower:
             distance: to where the policy takes it to be [m]; None: it does not know.
             look: at the route, from where the robot is.
         """
+        if self._searches:
+            return None
         if self.shown != self.target:
+            self._waited += 1
+            if self._waited > PATIENCE:
+                return self._search()
             if distance is not None and distance < PASS_M:
                 return self.arrived(look)
             if decisions >= MOST_DECISIONS:
@@ -68,10 +77,9 @@ class RouteFollower:
             self._since = decisions
         elif decisions - self._since >= LOOK_EVERY:
             self._since = decisions
-            before = self.shown
             self._locate(look)
             found = self._further(look)
-            if found != before and self.here is not None:
+            if self.here is not None and found != self.shown:
                 return self._show(found)
         return None
 
@@ -87,12 +95,16 @@ class RouteFollower:
             return None
         self._failures += 1
         missed, self.here = self.shown, None
-        if self._failures == TRIES:
-            return self._show(self.target)
+        if self._failures == TRIES or self._waited > PATIENCE:
+            return self._search()
         self._locate(look)
         found, way = self._further(look), self._way(missed)
         # Not the same once more, nor one before it.
         return self._show(found if (found - missed) * way > 0 else missed + way)
+
+    def _search(self) -> int:
+        self._searches = True
+        return self._show(self.target)
 
     def _next(self, look: Look) -> int:
         self._locate(look)
@@ -101,6 +113,8 @@ class RouteFollower:
     def _show(self, number: int) -> int:
         self.shown, self._since = number, 0
         self.passed += 1
+        if self.here is not None and abs(self.target - number) < self._left:
+            self._left, self._waited = abs(self.target - number), 0
         return number
 
     def _way(self, number: int) -> int:
