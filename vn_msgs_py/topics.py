@@ -67,8 +67,8 @@ TOPICS = (
              'true: it declares arrival and stands still; false: it does not, published '
              'again for every goal'),
     _latched('goal_status', _STRING, 'policy',
-             'JSON: number of the goal; waiting, active, succeeded, failed or cancelled; error '
-             'code and message (docs/nav2.md), decisions, seconds'),
+             'JSON: number of the goal, stamp of its picture; waiting, active, succeeded, failed '
+             'or cancelled; error code and message (docs/nav2.md), decisions, seconds'),
     Topic('route_goal', _STRING, 'user', 'where route_node drives: the name of a place, or the '
           'number of a picture; empty: stop', depth=1),
     _latched('route_status', _STRING, 'route',

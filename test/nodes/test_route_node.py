@@ -186,7 +186,7 @@ def test_what_fails_is_said(way, tmp_path):
         with child(NODE, tmp_path / 'other', route=folder):
             wait_until(lambda: goal.get_subscription_count() and watch.said, watch.spin)
             # A policy without a camera, then one that does not answer.
-            status.publish(String(data=json.dumps({'goal': 4, 'status': 'none'})))
+            status.publish(String(data=json.dumps({'goal': 4, 'stamp': [1, 0]})))
             goal.publish(String(data='2'))
             wait_until(lambda: 'no picture' in watch.said[-1]['error_msg'], watch.spin)
             camera = watch.node.create_publisher(Image, 'image_raw', qos('image_raw'))
@@ -198,10 +198,10 @@ def test_what_fails_is_said(way, tmp_path):
                 watch.spin()
             wait_until(lambda: 'does not answer' in watch.said[-1]['error_msg'], show)
             # Somebody else shows a goal; a place that is none ends the way, too.
-            for said, end in ((6, 'another goal came'), (3, 'began anew')):
+            for number, end in ((6, 'another goal came'), (3, 'began anew')):
                 goal.publish(String(data='2'))
                 wait_until(lambda: watch.said[-1]['status'] == 'active', show)
-                status.publish(String(data=json.dumps({'goal': said, 'status': 'waiting'})))
+                status.publish(String(data=json.dumps({'goal': number, 'stamp': [2, 0]})))
                 wait_until(lambda end=end: end in watch.said[-1]['error_msg'], show)
             goal.publish(String(data='2'))
             wait_until(lambda: watch.said[-1]['status'] == 'active', show)

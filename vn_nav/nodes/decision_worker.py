@@ -202,19 +202,21 @@ class DecisionWorker:
             self._goal_in_force = message
             budget = self._navigator.goal_limits.max_decisions
         self._runtime.set_budget(budget or None)
-        found = prepared(self._prepare_goal, message, self._wake, self._refuse_goal)
+        found = prepared(self._prepare_goal, message, self._wake,
+                         lambda why: self._refuse_goal(message, why))
         if found is None:
             return
         picture, _, view = found
         self._runtime.set_goal(picture, view)
         with self._wake:
             if self._goal is None:  # else a newer one is waiting
-                stamp = message.header.stamp
-                self._navigator.accept_goal(stamp.sec + stamp.nanosec * 1e-9 if self._lock_step
+                self.goal_output.stamp = sec, nanosec = _stamp(message)
+                self._navigator.accept_goal(sec + nanosec * 1e-9 if self._lock_step
                                             else -math.inf, again)
                 self.publish_arrival(again=True)
 
-    def _refuse_goal(self, why: str) -> None:
+    def _refuse_goal(self, message: Image, why: str) -> None:
+        self.goal_output.stamp = _stamp(message)
         self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
         self._navigator.refuse_goal(why)
         self.goal_output.publish()

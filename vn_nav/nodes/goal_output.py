@@ -30,6 +30,7 @@ class GoalOutput:
         arrival, distance: probability that the robot has arrived, and metres to where the goal is
             taken to be, at the newest decision; NaN: unknown.
         estimate: the same as a pose, in a frame; None: unknown.
+        stamp: seconds and nanoseconds of the newest goal's picture.
     """
 
     def __init__(self, node, navigator: Navigator):
@@ -42,12 +43,13 @@ class GoalOutput:
         self._of = 0  # number of the goal of what follows
         self.arrival = self.distance = math.nan
         self.estimate: PoseStamped | None = None
+        self.stamp = 0, 0
 
     def status(self) -> dict:
         """Where the newest goal stands, as JSON's values."""
         goal = self._navigator.goal
-        return {'goal': goal.number, 'status': goal.status.value, 'error_code': int(goal.code),
-                'error_msg': goal.message, 'decisions': self._navigator.decisions,
+        return {'goal': goal.number, 'stamp': self.stamp, 'status': goal.status.value,
+                'error_code': int(goal.code), 'error_msg': goal.message, 'decisions': self._navigator.decisions,
                 'seconds': round(goal.seconds(time.monotonic()), 2)}
 
     def publish(self) -> None:

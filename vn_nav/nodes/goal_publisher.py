@@ -19,10 +19,13 @@ class GoalPublisher:
 
     Args:
         node: that publishes.
+
+    Attributes:
+        stamp: seconds and nanoseconds of the newest goal.
     """
 
     def __init__(self, node: Node):
-        self._node = node
+        self._node, self.stamp = node, (0, 0)
         self._picture = node.create_publisher(Image, 'goal_image', qos('goal_image'))
         self._camera: Publisher | None = None
 
@@ -38,7 +41,8 @@ class GoalPublisher:
         """
         height, width = picture.shape[:2]
         message = fill_image(Image(), picture, 'rgb8')
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = now = self._node.get_clock().now().to_msg()
+        self.stamp = now.sec, now.nanosec
         lens = "as wide as the robot's camera: the file does not say its focal length"
         if fov is not None:
             lens = f'{math.degrees(fov):.0f} deg on its shorter side'

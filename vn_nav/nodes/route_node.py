@@ -8,6 +8,7 @@ policy_node's ~/stop and ~/enable end a way along a route as they end any goal.
 
 from __future__ import annotations
 
+import collections
 import enum
 import json
 import sys
@@ -29,6 +30,7 @@ from vn_nav.nodes.process import Ended, run_node, spin
 from vn_nav.nodes.qos import qos, subscribe
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.frame_gate import shorten
+from vn_nav.policy.goal_record import Code
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.resources import share_file
 from vn_nav.routes.follower import RouteFollower
@@ -44,6 +46,8 @@ PARAMETERS = {
     'policy': ('policy_node', "name of the policy's node"),
     **{name: policy_parameters.PARAMETERS[name] for name in _SHARED},
 }
+# Why a picture was not reached; another one may be. Other failures are of the robot.
+OF_THE_GOAL = Code.BUDGET, Code.NO_PROGRESS, Code.BLOCKED, Code.GOAL_REFUSED
 PATIENCE_S = 10.0  # for a picture, and until motion can be enabled
 TEND_S = 0.1
 AGAIN_S = 0.5  # until motion is asked for again
@@ -75,7 +79,8 @@ class RouteNode(Node):
             raise UserError('route_node has a route', 'none',
                             'give its folder with -p route:=FOLDER')
         self._route = read_route(value['route'])
-        self._files = [self._route.picture(k) for k in range(len(self._route))]
+        for k in range(len(self._route)):
+            self._route.picture(k)  # it can be read
         if value['place']:
             self._route.index(value['place'])
         self._runtime = PolicyRuntime(value['checkpoint'] or share_file('models/search'))
@@ -93,7 +98,8 @@ class RouteNode(Node):
         self._status, self._message, self._said = RouteStatus.NONE, '', ''
         self._since = 0.0  # steady time of this status, or of the newest picture shown [s]
         self._number: int | None = None  # of policy_node's newest goal; None: it said nothing yet
-        self._ours: int | None = None  # of the picture shown
+        self._ours: tuple[int, int] | None = None  # stamp of the picture shown
+        self._shown: collections.deque[tuple[int, int]] = collections.deque(maxlen=10)  # of late
         self._enables: ServiceCall | None = None
         self._goals = GoalPublisher(self)
         self._enable = self.create_client(SetBool, f'{value["policy"]}/enable')
@@ -137,32 +143,36 @@ class RouteNode(Node):
         before, self._number = self._number, said['goal']
         if self._status is not RouteStatus.ACTIVE:
             return
-        if before is not None and said['goal'] < before:
-            self._cancel('policy_node began anew', RouteStatus.FAILED)
-        elif self._ours is not None and said['goal'] > self._ours:
-            self._end(RouteStatus.CANCELLED, 'another goal came')
-        elif said['goal'] == self._ours:
+        stamp = tuple(said['stamp'])
+        if stamp == self._ours:
             self._take(said)
+        elif before is not None and said['goal'] < before:
+            self._cancel('policy_node began anew', RouteStatus.FAILED)
+        elif before is not None and said['goal'] > before and stamp not in self._shown:
+            self._end(RouteStatus.CANCELLED, 'another goal came')
 
     def _take(self, said: dict) -> None:
         """How it stands with the picture shown."""
         assert self._follower is not None  # there is a way
-        if said['status'] == 'active':
+        status, why = said['status'], said['error_msg']
+        if status == 'active':
             self._enables = None
-        elif said['status'] == 'waiting' and self._enables is None:
+        elif status == 'waiting' and self._enables is None:
             self._end(RouteStatus.CANCELLED, 'motion was disabled')
-        elif said['status'] == 'succeeded' and self._follower.shown == self._target:
+        elif status == 'succeeded' and self._follower.shown == self._target:
             self._end(RouteStatus.SUCCEEDED)
-        elif said['status'] == 'succeeded':
+        elif status == 'succeeded':
             self._go_on(self._follower.arrived)
-        elif said['status'] == 'failed':
-            self._go_on(self._follower.failed, said['error_msg'])
-        elif said['status'] == 'cancelled':
-            self._end(RouteStatus.CANCELLED, said['error_msg'])
+        elif status == 'failed' and said['error_code'] in OF_THE_GOAL:
+            self._go_on(self._follower.failed, why)
+        elif status == 'failed':
+            self._end(RouteStatus.FAILED, why)
+        elif status == 'cancelled':
+            self._end(RouteStatus.CANCELLED, why)
 
     def _on_feedback(self, message: String) -> None:
         said = json.loads(message.data)
-        if self._status is RouteStatus.ACTIVE and said['goal'] == self._ours and (
+        if self._status is RouteStatus.ACTIVE and tuple(said['stamp']) == self._ours and (
                 said['status'] == 'active' and self._follower is not None):
             follower = self._follower
             self._decisions += 1
@@ -247,14 +257,20 @@ class RouteNode(Node):
         assert self._runtime.search is not None  # looked at in __init__
         own = self._pictures
         return RouteEyes(self._runtime.search.eyes,
-                         np.stack([own.file(picture, fov) for picture, fov in self._files]),
+                         np.stack([own.file(*self._route.picture(k))
+                                   for k in range(len(self._route))]),
                          self._runtime.zoom_of(own.fov, own.aspect))
 
     def _show(self, index: int) -> None:
         """Show policy_node a picture of the route."""
-        assert self._number is not None  # waited for
-        self._ours, self._since, self._message = self._number + 1, time.monotonic(), ''
-        self._goals.show(*self._files[index])
+        self._since, self._message = time.monotonic(), ''
+        try:
+            self._goals.show(*self._route.picture(index))
+        except UserError as error:
+            self._cancel(str(error), RouteStatus.FAILED)
+            return
+        self._ours = self._goals.stamp
+        self._shown.append(self._ours)
 
     def _cancel(self, why: str, status: RouteStatus = RouteStatus.CANCELLED) -> None:
         """End a way, if there is one, and have the robot stand still."""
