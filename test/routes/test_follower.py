@@ -140,7 +140,7 @@ def test_a_way_that_gets_nowhere_ends_in_a_search_for_the_target():
     follower.begin(corridor.look)
     shown = [follower.shown]
     # It is carried to and fro: what it is shown is never reached, and never long enough to fail.
-    for k in range(300):
+    for k in range(500):
         corridor.robot = 3.0 * (k // 4 % 2)
         found = follower.decided(1 + k % 4, None if k % 4 == 3 else 2.0, corridor.look)
         if found is not None:

@@ -49,7 +49,8 @@ class GoalOutput:
         """Where the newest goal stands, as JSON's values."""
         goal = self._navigator.goal
         return {'goal': goal.number, 'stamp': self.stamp, 'status': goal.status.value,
-                'error_code': int(goal.code), 'error_msg': goal.message, 'decisions': self._navigator.decisions,
+                'error_code': int(goal.code), 'error_msg': goal.message,
+                'decisions': self._navigator.decisions,
                 'seconds': round(goal.seconds(time.monotonic()), 2)}
 
     def publish(self) -> None:

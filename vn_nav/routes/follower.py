@@ -23,7 +23,7 @@ REACH_M = 3.0  # a picture farther away is no goal yet
 PASS_M = 0.8  # so near a picture the next one is shown
 LOOK_EVERY = 4  # decisions, while it has no idea where its goal is
 MOST_DECISIONS = 60  # for one picture
-PATIENCE = 80  # decisions in which it has to be shown a picture nearer to the target
+PATIENCE, PATIENCE_EACH = 200, 4  # decisions, and more for each picture, until it searches
 TRIES = 3  # pictures in a row that it does not reach, before it is shown the last one
 
 
@@ -47,8 +47,7 @@ class RouteFollower:
         self.passed = -1
         self._failures = 0
         self._since = 0  # decisions for the picture shown, when it last looked
-        self._left = count  # pictures from the one shown to the target, at least so far
-        self._waited = 0  # decisions since it has become less
+        self._decided = 0  # decisions on pictures before the target
         self._searches = False  # for the target, whatever it sees of the route
 
     def begin(self, look: Look) -> int:
@@ -66,8 +65,8 @@ class RouteFollower:
         if self._searches:
             return None
         if self.shown != self.target:
-            self._waited += 1
-            if self._waited > PATIENCE:
+            self._decided += 1
+            if self._decided > PATIENCE + PATIENCE_EACH * self.count:
                 return self._search()
             if distance is not None and distance < PASS_M:
                 return self.arrived(look)
@@ -95,7 +94,7 @@ class RouteFollower:
             return None
         self._failures += 1
         missed, self.here = self.shown, None
-        if self._failures == TRIES or self._waited > PATIENCE:
+        if self._failures == TRIES:
             return self._search()
         self._locate(look)
         found, way = self._further(look), self._way(missed)
@@ -113,8 +112,6 @@ class RouteFollower:
     def _show(self, number: int) -> int:
         self.shown, self._since = number, 0
         self.passed += 1
-        if self.here is not None and abs(self.target - number) < self._left:
-            self._left, self._waited = abs(self.target - number), 0
         return number
 
     def _way(self, number: int) -> int:
