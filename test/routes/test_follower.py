@@ -22,7 +22,7 @@ class Corridor:
     def look(self, rows):
         self.looks.append(len(rows))
         gap = np.abs(SPACING * np.asarray(rows) - self.robot)
-        seen = np.where(gap <= VIEW, 0.9, 0.03)
+        seen = np.where(gap <= VIEW, 0.98, 0.03)
         if self.alike is not None:
             seen[np.asarray(rows) == self.alike] = 0.99
         return Sighting(seen, np.minimum(gap, VIEW))

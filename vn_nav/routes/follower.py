@@ -16,8 +16,11 @@ from vn_nav.routes.recognition import Sighting
 
 Look = Callable[[np.ndarray], Sighting]  # at the pictures of these numbers [R]
 
-SEEN = 0.5  # probability from which on a picture is in view
-LOCATED = 1.0  # that a picture and half of each neighbour have together
+# Probability from which on a picture is in view. Of hundreds of pictures some look alike, and the
+# one nearest to the target is chosen: at 0.5 it is right in 0.6 of the looks, at 0.97 in 0.94
+# (with a neighbour that is seen as well; two tours of 360 pictures, 120 looks).
+SEEN = 0.97
+LOCATED = 1.5  # that a picture and half of each neighbour have together
 WINDOW = 10  # pictures to either side that are looked at, while the robot knows where it is
 REACH_M = 3.0  # a picture farther away is no goal yet
 PASS_M = 0.8  # so near a picture the next one is shown
