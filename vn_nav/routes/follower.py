@@ -17,8 +17,7 @@ from vn_nav.routes.recognition import Sighting
 Look = Callable[[np.ndarray], Sighting]  # at the pictures of these numbers [R]
 
 # Probability from which on a picture is in view. Of hundreds of pictures some look alike, and the
-# one nearest to the target is chosen: at 0.5 it is right in 0.6 of the looks, at 0.97 in 0.94
-# (with a neighbour that is seen as well; two tours of 360 pictures, 120 looks).
+# one nearest to the target is chosen, so it has to be nearly certain (bench/route_looks.py).
 SEEN = 0.97
 LOCATED = 1.5  # that a picture and half of each neighbour have together
 WINDOW = 10  # pictures to either side that are looked at, while the robot knows where it is
