@@ -9,9 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record_drive import RecordedDrive, bridge_parameters, read_drive, write_figures
+from record_drive import (
+    CAMERA_RATE_HZ,
+    RecordedDrive,
+    bridge_parameters,
+    read_drive,
+    write_figures,
+)
 
-from vn_nav.arrival import arrived
+from vn_nav.arrival import arrived, wrap_angle
 from vn_nav.bags.roles import Topics
 from vn_nav.cli.world import machine
 from vn_nav.errors import UserError
@@ -25,7 +31,7 @@ from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.report.tables import print_rows
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
-from vn_nav.routes.follower import SEEN, RouteFollower
+from vn_nav.routes.follower import RouteFollower
 from vn_nav.routes.from_bag import pictures_along
 from vn_nav.routes.recognition import RouteEyes, Sighting
 from vn_nav.scenes import house_scene
@@ -66,7 +72,7 @@ def drive(options) -> dict[str, list[Episode]]:
             policy = PolicyRuntime(checkpoint, seed=options.seed,
                                    stop_threshold=_threshold(options, checkpoint),
                                    keep_map=row == ROUTE)
-            along = AlongRoute(policy, out / 'bag') if row == ROUTE else None
+            along = AlongRoute(policy, out / 'bag', goals) if row == ROUTE else None
             episodes[row] = without_ros(options, policy, load_goal_pictures(shown), along)
         else:
             episodes[row] = over_ros(options, row, checkpoint, shown)
@@ -157,27 +163,28 @@ def _wait(processes: Processes, bridge: str, watch: Any, count: int) -> None:
 
 
 class AlongRoute:
-    """What `route_node` does, without ROS: goals are the pictures of a route most like them.
+    """What `route_node` does, without ROS.
 
     Args:
         policy: that drives; bag: out of which the route is taken.
+        goals: each is named as the picture of the route that was taken nearest to it.
     """
 
-    def __init__(self, policy: PolicyRuntime, bag: Path):
+    def __init__(self, policy: PolicyRuntime, bag: Path, goals: list[GoalPicture]):
         assert policy.search is not None  # it searches
         self._policy = policy
-        along = [own.picture for own in pictures_along(bag, Topics())]
-        self._pictures = [preprocess(picture, policy.size) for picture in along]
+        along = list(pictures_along(bag, Topics()))
+        self._pictures = [preprocess(own.picture, policy.size) for own in along]
         self._eyes = RouteEyes(policy.search.eyes, np.stack(self._pictures))
-        self.count = len(along)
+        taken = read_drive(bag).pictured[[round(own.time * CAMERA_RATE_HZ) for own in along]]
+        self._targets = [int((np.hypot(*(taken[:, :2] - goal.pose[:2]).T)
+                              + np.abs(wrap_angle(taken[:, 2] - goal.pose[2]))).argmin())
+                         for goal in goals]
 
-    def set_out(self, goal: np.ndarray) -> None:
-        """Towards a goal picture [3,S,S], which is put at the end of what it is most like."""
-        seen = self._eyes.look(goal, np.arange(self.count))
-        own = np.where(seen.co_visible >= SEEN, seen.distance, np.inf)
-        self._target = int(own.argmin()) if np.isfinite(own).any() else int(
-            seen.co_visible.argmax())
-        self._follower, self._goal = RouteFollower(self.count, self._target), goal
+    def set_out(self, number: int, goal: np.ndarray) -> None:
+        """Towards a goal, by its number, and its picture [3,S,S]."""
+        self._target, self._goal = self._targets[number], goal
+        self._follower = RouteFollower(len(self._pictures), self._target)
         self._begins, self._decisions = True, 0
         self._policy.reset()  # the robot is elsewhere
         self._policy.set_goal(goal)
@@ -242,7 +249,7 @@ def without_ros(options, policy: PolicyRuntime | None, pictures: list[GoalPictur
         episode, seconds, reached = robot.begin_episode(index), 0.0, False
         if policy is not None:
             shown = preprocess(pictures[episode.goal].picture, policy.size)
-            policy.set_goal(shown) if along is None else along.set_out(shown)
+            policy.set_goal(shown) if along is None else along.set_out(episode.goal, shown)
         while True:
             action = choose()
             if action == len(deltas):
