@@ -190,27 +190,27 @@ class AlongRoute:
         self._policy.set_goal(goal)
 
     def act(self, picture: np.ndarray, odometry: np.ndarray) -> int:
-        """The next action; the policy has arrived only where it is at the goal itself."""
+        """The next action; the policy has `arrived` only where it is at the goal itself."""
         def look(rows: np.ndarray) -> Sighting:
             return self._eyes.look(picture, rows)
 
-        if self._begins:
-            self._begins = False
-            self._show(self._follower.begin(look))
-        action = self._policy.act(picture, odometry)
-        self._decisions += 1
-        estimate = self._policy.goal_estimate
-        distance = None if estimate is None else float(np.hypot(*estimate[:2]))
-        if self._policy.arrived:
-            if self._follower.shown == self._target:
+        found = self._follower.begin(look) if self._begins else None
+        self._begins = False
+        while True:
+            if found is not None:
+                self._show(found)
+            action = self._policy.act(picture, odometry)
+            self._decisions += 1
+            estimate = self._policy.goal_estimate
+            distance = None if estimate is None else float(np.hypot(*estimate[:2]))
+            if self._policy.arrived:
+                if self._follower.shown == self._target:
+                    return action
+                found = self._follower.arrived(look)
+            else:
+                found = self._follower.decided(self._decisions, distance, look)
+            if found is None:
                 return action
-            self._show(self._follower.arrived(look))
-            return self._policy.act(picture, odometry)
-        found = self._follower.decided(self._decisions, distance, look)
-        if found is not None:
-            self._show(found)
-            return self._policy.act(picture, odometry)
-        return action
 
     def _show(self, number: int) -> None:
         self._decisions = 0
