@@ -105,6 +105,15 @@ def test_a_robot_that_sees_nothing_is_shown_the_target_until_it_sees_something()
     assert shown and follower.here == 6 and 6 < shown[0] < 14
 
 
+def test_what_is_reached_is_not_shown_again():
+    corridor = Corridor()
+    follower = RouteFollower(40, 39)
+    shown = [follower.begin(corridor.look)]
+    for _ in range(3):  # it says so from where it stands
+        shown.append(follower.decided(1, PASS_M / 2, corridor.look))
+    assert shown == sorted(set(shown))
+
+
 def test_what_is_not_reached_is_passed_over_and_then_given_up():
     corridor = Corridor()
     follower = RouteFollower(40, 39)

@@ -54,7 +54,8 @@ class RouteFollower:
 
     def begin(self, look: Look) -> int:
         """The first picture to show."""
-        return self._next(look)
+        self._locate(look)
+        return self._show(self._further(look))
 
     def decided(self, decisions: int, distance: float | None, look: Look) -> int | None:
         """Another picture to show, after a decision; None: go on.
@@ -88,7 +89,7 @@ class RouteFollower:
         """The next picture: the one shown is reached."""
         self._failures = 0
         self.here = self.shown
-        return self._next(look)
+        return self._beyond(self.shown, look)
 
     def failed(self, look: Look) -> int | None:
         """What to show after a picture that was not reached; None: the route is given up."""
@@ -98,18 +99,17 @@ class RouteFollower:
         missed, self.here = self.shown, None
         if self._failures == TRIES:
             return self._search()
-        self._locate(look)
-        found, way = self._further(look), self._way(missed)
-        # Not the same once more, nor one before it.
-        return self._show(found if (found - missed) * way > 0 else missed + way)
+        return self._beyond(missed, look)
 
     def _search(self) -> int:
         self._searches = True
         return self._show(self.target)
 
-    def _next(self, look: Look) -> int:
+    def _beyond(self, number: int, look: Look) -> int:
+        """Show one that lies behind a picture on the way: not that one again, nor one before."""
         self._locate(look)
-        return self._show(self._further(look))
+        found, way = self._further(look), self._way(number)
+        return self._show(found if (found - number) * way > 0 else number + way)
 
     def _show(self, number: int) -> int:
         self.shown, self._since = number, 0
