@@ -163,6 +163,8 @@ def test_a_disk_that_fails_ends_the_recording_and_not_the_node(talker, tmp_path)
                                lambda message: states.extend(message.status), qos('/diagnostics'))
     with child(RECORDER, tmp_path / 'log', output=tmp_path / 'bag') as process:
         heard_by(publisher)
+        # It says that it records before it cannot any more.
+        wait_until(lambda: states, lambda: rclpy.spin_once(talker, timeout_sec=0.1))
         # As on a full disk, a write fails; not at once, as the middleware has files of its own.
         _, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1_000_000, hard))
