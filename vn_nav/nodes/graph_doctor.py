@@ -15,12 +15,10 @@ from typing import Any
 import rclpy
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from vn_msgs_py.topics import BEST_EFFORT, LATCHED, RELIABLE, TOPICS, VOLATILE, topic
@@ -42,6 +40,7 @@ from vn_nav.nodes.heard import Heard
 from vn_nav.nodes.qos import profile
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.nodes.taps import message_class
+from vn_nav.nodes.visit import visiting
 from vn_nav.policy.navigator import Limits
 
 NAME = 'vn_nav_doctor'
@@ -87,23 +86,8 @@ def look(options: Look) -> Graph:
     Raises:
         UserError: the middleware cannot start, or `base_check` where it must not be tried.
     """
-    context = Context()
-    try:
-        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-        node = Node(NAME, namespace=options.namespace or None, context=context,
-                    start_parameter_services=False, enable_rosout=False)
-    except Exception as error:  # of C code, in many classes
-        context.try_shutdown()
-        raise UserError('a node can join the graph', ' '.join(str(error).split())[:200],
-                        'correct the namespace, RMW_IMPLEMENTATION and ROS_DOMAIN_ID') from error
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    try:
+    with visiting(NAME, options.namespace) as (node, executor):
         return _Doctor(node, executor, options).look()
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()
 
 
 class _Doctor:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from typing import Any
 
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
 from vn_nav.errors import UserError
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.visit import visiting
 
 SILENCE_S = 30.0  # without a word of route_node while it drives
 LEAVE_S = 0.5  # for the middleware to deliver the last word
@@ -32,20 +29,11 @@ class RouteClient:
     """
 
     def __init__(self, namespace: str, patience: float):
-        self._patience, self._context = patience, Context()
+        self._patience = patience
         self._heard: list[dict[str, Any]] = []
-        try:
-            rclpy.init(args=[], context=self._context,
-                       signal_handler_options=SignalHandlerOptions.NO)
-            self._node = Node('vn_nav_goal', namespace=namespace or None, context=self._context,
-                              start_parameter_services=False, enable_rosout=False)
-        except Exception as error:  # of C code, in many classes
-            self._context.try_shutdown()
-            raise UserError('a node can join the graph', ' '.join(str(error).split())[:200],
-                            'correct the namespace, RMW_IMPLEMENTATION and ROS_DOMAIN_ID'
-                            ) from error
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._visit = contextlib.ExitStack()
+        self._node, self._executor = self._visit.enter_context(
+            visiting('vn_nav_goal', namespace))
         self._goal = self._node.create_publisher(String, 'route_goal', qos('route_goal'))
         self._node.create_subscription(String, 'route_status', self._hear,
                                        qos('route_status', depth=50))
@@ -57,9 +45,7 @@ class RouteClient:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        self._visit.close()
 
     def status(self) -> dict[str, Any]:
         """What route_node said last.
