@@ -60,10 +60,14 @@ def child(module, log, *, rules=(), **parameters):
 
 
 def wait_until(condition, spin, seconds=PATIENCE, what=''):
-    """Call `spin` until the condition holds; the seconds it took. `what` tells of a failure."""
+    """Call `spin` until the condition holds; the seconds it took.
+
+    `what` tells of a failure: a text, or what makes one then.
+    """
     begun = time.monotonic()
     while not condition():
-        assert time.monotonic() - begun < seconds, f'not within {seconds} s: {what or condition}'
+        assert time.monotonic() - begun < seconds, (
+            f'not within {seconds} s: {what() if callable(what) else what or condition}')
         spin()
     return time.monotonic() - begun
 

@@ -36,7 +36,7 @@ def until(robot, status, number=None):
     """Spin until the newest goal has a status; what was said of it."""
     wait_until(lambda: robot.said and robot.said[-1]['status'] == status
                and number in (None, robot.said[-1]['goal']), robot.spin,
-               what=f'{status} of goal {number}, but {robot.said[-3:]}')
+               what=lambda: f'{status} of goal {number}, but {robot.said[-3:]}')
     return robot.said[-1]
 
 

@@ -22,5 +22,5 @@ def test_it_drives(write, modules, tmp_path):
                      mode='continuous') as (robot, process):
         robot.show_goal()
         robot.enable()
-        wait_until(robot.moving, robot.spin, what=(tmp_path / 'log').read_text())
+        wait_until(robot.moving, robot.spin, what=(tmp_path / 'log').read_text)
         assert process.poll() is None

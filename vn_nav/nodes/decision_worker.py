@@ -87,6 +87,7 @@ class DecisionWorker:
         self._frame: tuple | None = None  # the newest message, its stamp, when it came
         self._goal: Image | None = None  # to be taken
         self._goal_in_force: Image | None = None
+        self._accepted: Image | None = None  # the newest goal that the navigator has accepted
         self._epoch = navigator.epoch
         self.inferences = Window(WINDOW_S)
         self._published: bool | None = None  # on `arrived`
@@ -198,7 +199,6 @@ class DecisionWorker:
 
     def _take_goal(self, message: Image) -> None:
         with self._wake:
-            again = message is self._goal_in_force
             self._goal_in_force = message
             budget = self._navigator.goal_limits.max_decisions
         self._runtime.set_budget(budget or None)
@@ -211,6 +211,7 @@ class DecisionWorker:
         with self._wake:
             if self._goal is None:  # else a newer one is waiting
                 self.goal_output.stamp = sec, nanosec = _stamp(message)
+                again, self._accepted = message is self._accepted, message
                 self._navigator.accept_goal(sec + nanosec * 1e-9 if self._lock_step
                                             else -math.inf, again)
                 self.publish_arrival(again=True)
