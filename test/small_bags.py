@@ -59,10 +59,11 @@ def odometry(time, x, yaw=0.0):
     return message
 
 
-def camera_info(time, focal=16.0, side=32):
-    centre = (side - 1) / 2  # pixels have their centres at integers
-    k = np.array([focal, 0, centre, 0, focal, centre, 0, 0, 1.0])
-    return make(INFO, header=header(time), height=side, width=side, k=k, d=np.zeros(0))
+def camera_info(time, focal=16.0, side=32, width=None):
+    width = width or side
+    # Pixels have their centres at integers.
+    k = np.array([focal, 0, (width - 1) / 2, 0, focal, (side - 1) / 2, 0, 0, 1.0])
+    return make(INFO, header=header(time), height=side, width=width, k=k, d=np.zeros(0))
 
 
 def twist(speed):

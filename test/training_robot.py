@@ -30,6 +30,7 @@ class Robot:
                            for name, kind in (
                                ('image_raw', Image), ('odom', Odometry), ('goal_image', Image),
                                ('camera_info', CameraInfo), ('collision', Bool),
+                               ('goal_camera_info', CameraInfo),
                                ('arrived', Bool), ('episode_end', UInt8))}
         self.node.create_subscription(Twist, 'cmd_vel', self._obey, qos('cmd_vel', depth=50))
         self.commands, self.pose, self.velocity = [], np.zeros(3), np.zeros(4)

@@ -214,6 +214,26 @@ class Camera:
         return float(falls.argmax()) * FOLD_TANGENT / RAYS if falls.any() else math.inf
 
 
+def flatten_goal(picture: np.ndarray, camera: Camera | None, other: Camera | None = None
+                 ) -> tuple[np.ndarray, float | None]:
+    """A goal picture as a pinhole camera would take it.
+
+    Args:
+        picture: [H,W,3] uint8 RGB.
+        camera: the robot's; None: unknown.
+        other: that took the picture; None: nobody says.
+
+    Returns:
+        The picture, and the field of view of its shorter side [rad]; None: unknown.
+    """
+    if other is not None:
+        return other.rectify(picture), other.fov
+    if camera is None:
+        return picture, None
+    # One of another format is of a camera that nobody describes: as wide as the robot's.
+    return camera.rectify(picture) if camera.fits(picture) else picture, camera.fov
+
+
 def _steps(length: int) -> np.ndarray:
     """Pixels [length] right of, or below, the middle of so many."""
     return np.arange(length) - (length - 1) / 2

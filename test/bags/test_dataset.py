@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from paths import ROOT
-from small_bags import IMAGE, START, drive, picture, write
+from small_bags import IMAGE, INFO, START, camera_info, drive, picture, write
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags import drive_cache
@@ -138,3 +138,28 @@ def test_a_simulator_that_was_reset_while_recording_gives_two_episodes_and_every
         split = write(tmp_path / f'{shift}b.mcap', drive(4.0) + again, chunked=False)
         whole = load_drives(split, dataclasses.replace(WANTED, every=True), tmp_path / 'cache')
         assert np.array_equal(whole.image, drives.image)
+
+
+@pytest.mark.parametrize('after', [False, True])
+def test_a_goal_of_another_camera_is_cut_by_that_one(tmp_path, after):
+    """Whatever the order in which the two were recorded; a narrower one shows too little."""
+    shades = np.arange(80, dtype=np.uint8)[:, None, None] * np.ones((1, 120, 3), np.uint8)
+    goals = []
+    for second, degrees in ((0, 100), (2, 70), (3, None)):
+        time = START + second * 10**9
+        shown = ('/goal_image', IMAGE, time + 1, picture(time, shades + second))
+        goals.append(shown)
+        if degrees:
+            lens = camera_info(time, focal=40 / math.tan(math.radians(degrees / 2)), side=80,
+                               width=120)
+            goals.append(('/goal_camera_info', INFO, time + (500_000_000 if after else 0), lens))
+    sent = [*drive(4.0), *goals, ('/camera_info', INFO, START, camera_info(START, focal=16.0))]
+    bag = write(tmp_path / 'bag.mcap', sorted(sent, key=lambda m: m[2]))
+    drives = load_drives(bag, dataclasses.replace(WANTED, every=True), tmp_path / 'cache')
+    target = WANTED.robot.camera_fov
+    expected = [preprocess(shades, 84, fov=math.radians(100), target_fov=target),
+                preprocess(shades + 3, 84, fov=math.radians(90), target_fov=target)]
+    assert np.array_equal(drives.goals, expected)
+    assert set(drives.goal) == {0, -1, 1}
+    assert drives.facts['notes'] == [
+        '1 goal picture left out: of a camera that sees less than 90 deg']

@@ -15,7 +15,18 @@ from shadow_drives import (
     scanned_drive,
     two_drives,
 )
-from small_bags import FIXTURE, IMAGE, INFO, ODOMETRY, START, drive, odometry, picture, write
+from small_bags import (
+    FIXTURE,
+    IMAGE,
+    INFO,
+    ODOMETRY,
+    START,
+    camera_info,
+    drive,
+    odometry,
+    picture,
+    write,
+)
 
 from vn_msgs_py.images import decode_rgb
 from vn_nav.bags.dataset import Wanted
@@ -149,3 +160,14 @@ def test_depth_pictures_come_with_their_camera_info(tmp_path):
     with pytest.raises(UserError, match='camera_info'):
         make_plan(write(tmp_path / 'none.mcap', messages + depth), ROBOT, Topics(),
                   ranges='depth')
+
+
+def test_a_goal_of_another_camera_says_what_it_shows(tmp_path):
+    goal = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    lens = camera_info(START, focal=20 / np.tan(np.radians(35)), side=40, width=60)
+    sent = [('/goal_camera_info', INFO, START, lens),
+            ('/goal_image', IMAGE, START + 1, picture(START, goal)), *drive(2.0)]
+    plan = make_plan(write(tmp_path / 'bag.mcap', sent), ROBOT, Topics())
+    shown = plan.goals.picture(0)
+    assert plan.goals.shown == 1 and shown.fov == pytest.approx(np.radians(70), abs=1e-3)
+    assert np.array_equal(shown.picture, goal)

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import os
 import re
 import signal
@@ -15,9 +16,12 @@ import pytest
 import torch
 from geometry_msgs.msg import Twist
 from ros_harness import PATIENCE, child, wait_until
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Bool, UInt8
 from training_robot import Lively, Robot
 
+from vn_msgs_py.camera import fill_camera_info
+from vn_msgs_py.images import decode_rgb, fill_image
 from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.doctor.checks import diagnose
 from vn_nav.bags.drive_cache import load_drives
@@ -29,6 +33,7 @@ from vn_nav.learning.trainer import train
 from vn_nav.learning.training import STATE
 from vn_nav.nodes.qos import qos
 from vn_nav.nodes.ros_env import RosEnv
+from vn_nav.observation import preprocess
 from vn_nav.policy.checkpoint import load_checkpoint
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
@@ -215,6 +220,23 @@ def test_a_signal_leaves_zero_and_a_checkpoint(robot, tmp_path, number):
         assert not robot.moves
     assert 'goal_pose is left out' in said(tmp_path)
     assert load_checkpoint(tmp_path / 'run' / 'checkpoint').info['frames'] >= 3
+
+
+@pytest.mark.parametrize('first', ['picture', 'camera'])
+def test_a_goal_of_another_camera_is_cut_by_that_one(robot, first):
+    """It sees 120 deg; the robot's own camera says nothing, and a policy sees 90."""
+    goal = fill_image(Image(), np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8))
+    goal.header.stamp = robot.node.get_clock().now().to_msg()
+    lens = fill_camera_info(CameraInfo(header=goal.header), 90, 60, math.radians(120))
+    said = [('goal_image', goal), ('goal_camera_info', lens)]
+    expected = preprocess(decode_rgb(goal), 36, fov=math.radians(120), target_fov=math.radians(90))
+    for name, message in said if first == 'picture' else reversed(said):
+        robot.publishers[name].publish(message)
+        time.sleep(0.1)
+    with Lively(robot), RosEnv(ROBOT, 36) as env:
+        seen, _ = env.reset()
+        assert np.array_equal(env.goals[seen['goal_index'][0]], expected)
+        assert len(env.shown_goals) == 1
 
 
 def test_what_a_robot_and_its_judge_say(robot):

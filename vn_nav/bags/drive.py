@@ -37,7 +37,9 @@ def find_topics(bag: str | Path, wanted: Topics) -> Topics:
 
 
 def timestamped_messages(bag: str | Path, topics: Topics) -> Iterator[TimestampedMessage]:
-    """The messages of a drive in the order of recording, one take after the other; no scans.
+    """The messages of a drive in the order of recording, one take after the other.
+
+    No scans, and not the cameras of goals: `vn_nav.bags.goal_cameras` reads those.
 
     Args:
         bag: a rosbag2 folder or an MCAP file.
@@ -46,7 +48,8 @@ def timestamped_messages(bag: str | Path, topics: Topics) -> Iterator[Timestampe
     Raises:
         BagError: damage, or a message that is not what its topic says.
     """
-    names = tuple(filter(None, dataclasses.astuple(dataclasses.replace(topics, scan=''))))
+    names = tuple(filter(None, dataclasses.astuple(
+        dataclasses.replace(topics, scan='', goal_camera_info=''))))
     for m in messages(bag, names, clocks=(topics.image, topics.odometry or topics.command)):
         yield TimestampedMessage(m.topic, m.message, m.time)
 

@@ -19,15 +19,16 @@ import numpy as np
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_nav.bags.dataset import MAX_DEPTH, Wanted
 from vn_nav.bags.drive import Frame, Report, find_topics, synchronise, timestamped_messages
+from vn_nav.bags.goal_cameras import GoalCameras, goal_stamp, read_goal_cameras
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter, Step
 from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.calibration import is_rectified, read_calibration
 from vn_nav.errors import UserError
 from vn_nav.observation import crop_fraction, needed_side, preprocess, preprocess_map
-from vn_nav.rectification import Camera
+from vn_nav.rectification import Camera, flatten_goal
 
-FORMAT = 4  # of the files; another one is decoded anew
+FORMAT = 5  # of the files; another one is decoded anew
 INDEX = 'index.json'
 # Pictures in the decoders at once: bounds the memory.
 MAX_PICTURES_IN_FLIGHT = 64
@@ -176,8 +177,9 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
     optional = {name: _Optional(name) for name in ('depth', 'labels') if facts['topics'][name]}
     if 'labels' in optional:
         optional['labels'].dtype = _label_type(bag, facts['topics']['labels'])
-    goals: dict[bytes, int] = {}
-    shown_goal, number, bad, unseen = None, -1, 0, 0
+    goals = _Goals(wanted, camera, read_goal_cameras(
+        bag, Topics(**facts['topics']), wanted.robot.camera_fov), columns)
+    bad = 0
     rows: list[list[float]] = []
     held = summary(bag)[facts['topics']['image']].count or math.inf
     for step, pictures in decoded(steps, wanted, camera):
@@ -188,11 +190,8 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
             if rows and rows[-1][2] == frame.episode:
                 rows[-1][1] = NO_ACTION  # where that action led to was not seen
             continue
-        if frame.goal is not shown_goal:
-            shown_goal = frame.goal
-            number = _keep_goal(shown_goal, wanted, camera, columns, goals)
-            unseen += number < 0 and shown_goal is not None
-        rows.append([frame.stamp, step.action, frame.episode, number, *frame.pose])
+        rows.append([frame.stamp, step.action, frame.episode, goals.number(frame.goal),
+                     *frame.pose])
         columns.append('image', pictures['image'])
         for name, counted in optional.items():
             counted.look(frame, pictures)
@@ -214,8 +213,7 @@ def decode_bag(bag: Path, wanted: Wanted, folder: Path, show: Callable[[float], 
         facts |= {'label_names': _label_names(bag, facts['topics']['labels']),
                   'classes': optional['labels'].most + 1}
     facts['notes'] = [note for counted in optional.values() if (note := counted.summary())]
-    if unseen:
-        facts['notes'].append(f'{unseen} goal picture{"s" * (unseen > 1)} cannot be decoded')
+    facts['notes'] += goals.notes()
     index = {'format': FORMAT, 'columns': columns.close(), 'facts': facts}
     (folder / INDEX).write_text(json.dumps(index, indent=1))
 
@@ -265,21 +263,56 @@ class _Optional:
         return f'{self._role} left out: {"; ".join(faults)}' if faults else ''
 
 
-def _keep_goal(message: Any, wanted: Wanted, camera: Camera | None, columns: _Columns,
-               goals: dict[bytes, int]) -> int:
-    """Number of a goal picture, which is kept once; -1: it is none, or cannot be decoded."""
-    lens = {} if camera is None else {'fov': camera.fov, 'target_fov': wanted.robot.camera_fov}
-    try:
-        picture = None if message is None else decode_rgb(message)
-    except ImageError:
-        picture = None
-    if picture is None:
-        return -1
-    if camera is not None and camera.fits(picture):
-        picture = camera.rectify(picture)
-    picture = preprocess(picture, wanted.size, **lens)
-    digest = hashlib.sha256(picture.tobytes()).digest()
-    if digest not in goals:
-        goals[digest] = len(goals)
-        columns.append('goals', picture)
-    return goals[digest]
+class _Goals:
+    """The goal pictures of a bag, each kept once.
+
+    Args:
+        wanted: of the pictures.
+        camera: the robot's; None: unknown.
+        others: that took some of the goals.
+        columns: get the pictures.
+    """
+
+    def __init__(self, wanted: Wanted, camera: Camera | None, others: GoalCameras,
+                 columns: _Columns):
+        self._wanted, self._camera, self._others = wanted, camera, others
+        self._columns = columns
+        self._numbers: dict[bytes, int] = {}  # by the digest of a picture
+        self._last: Any = None
+        self._number = -1  # of the last one
+        self._undecoded = self._narrow = 0
+
+    def number(self, message: Any) -> int:
+        """Of a goal picture; -1: there is none, or it cannot be used."""
+        if message is not self._last:
+            self._last = message
+            self._number = self._keep(message)
+        return self._number
+
+    def _keep(self, message: Any) -> int:
+        if message is None:
+            return -1
+        other = self._others.get(goal_stamp(message))
+        target = self._wanted.robot.camera_fov
+        try:
+            picture, fov = flatten_goal(decode_rgb(message), self._camera, other)
+        except ImageError:
+            self._undecoded += 1
+            return -1
+        try:
+            picture = preprocess(picture, self._wanted.size, fov=fov, target_fov=target)
+        except UserError:  # the robot's own camera was looked at before
+            self._narrow += 1
+            return -1
+        digest = hashlib.sha256(picture.tobytes()).digest()
+        if digest not in self._numbers:
+            self._numbers[digest] = len(self._numbers)
+            self._columns.append('goals', picture)
+        return self._numbers[digest]
+
+    def notes(self) -> list[str]:
+        """How many were left out, and why."""
+        fov = math.degrees(self._wanted.robot.camera_fov)
+        return [f'{count} goal picture{"s" * (count > 1)} {why}' for count, why in (
+            (self._undecoded, 'cannot be decoded'),
+            (self._narrow, f'left out: of a camera that sees less than {fov:.0f} deg')) if count]

@@ -21,6 +21,7 @@ TYPES = {  # of each role of `Topics`
     'command': ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'),
     'goal': (IMAGE, COMPRESSED), 'depth': (IMAGE,), 'labels': (IMAGE,),
     'episode_end': ('std_msgs/msg/UInt8',), 'camera_info': (CAMERA_INFO,),
+    'goal_camera_info': (CAMERA_INFO,),
     'scan': ('sensor_msgs/msg/LaserScan',)}
 MAX_PROPOSED_TOPICS = 4  # topics that are proposed, at most
 
@@ -40,6 +41,7 @@ class Topics:
     labels: str = 'labels/image_raw'
     episode_end: str = 'episode_end'
     camera_info: str = 'camera_info'
+    goal_camera_info: str = 'goal_camera_info'  # of goals that another camera took
     scan: str = ''  # for a policy's map, where it is asked for; training reads none
 
     def within(self, recorded: Mapping[str, str]) -> Topics:

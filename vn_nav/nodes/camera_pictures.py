@@ -15,7 +15,7 @@ from vn_nav.observation import needed_side
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.policy.search.local_features import SIDE
 from vn_nav.policy.search.views import SIFT, View
-from vn_nav.rectification import Camera
+from vn_nav.rectification import Camera, flatten_goal
 
 # A square picture [3,S,S], its zoom, and all of it where the policy verifies.
 Prepared = tuple[np.ndarray, float, View | None]
@@ -92,15 +92,10 @@ class CameraPictures:
         Args:
             message: the picture; other: camera that took it; None: nobody says.
         """
-        camera, fov = self.camera, self.fov
-        if other is not None:
-            picture = other.rectify(self._decode(message, other))
-            return self._show(picture, other.fov, self._runtime.zoom_of(fov, self.aspect))
-        picture = self._decode(message, camera)
-        if camera is not None and camera.fits(picture):
-            picture = camera.rectify(picture)
-        # Else it is of another camera, which nobody describes: as wide as the robot's.
-        return self._show(picture, fov)
+        camera = self.camera
+        picture, fov = flatten_goal(self._decode(message, other or camera), camera, other)
+        zoom = None if other is None else self._runtime.zoom_of(self.fov, self.aspect)
+        return self._show(picture, fov or self._assumed_fov, zoom)
 
     def file(self, picture: np.ndarray, fov: float | None) -> np.ndarray:
         """As `goal`, [3,S,S], of a picture [H,W,3] and its field of view; None: the robot's."""

@@ -28,7 +28,7 @@ from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_watch import GoalWatch
 from vn_nav.policy.navigator import Navigator
 from vn_nav.policy.pose_track import EpisodePose
-from vn_nav.rectification import Camera
+from vn_nav.rectification import Camera, flatten_goal
 from vn_nav.robot import RobotSpec
 
 # What comes with a picture, by the key of `info`: topic and decoder.
@@ -89,6 +89,9 @@ class Senses:
         self._goal_watch = GoalWatch(trust_stamps=lock_step)
         self._knows_pose = False  # once
         self._maps: dict[str, collections.deque] = {}  # (stamp, message) by key
+        # Of goal pictures that another camera took: the newest, and its stamp.
+        self._goal_camera: tuple[tuple[int, int], Camera] | None = None
+        self._goal_message: Image | None = None  # in force
         self.goal: np.ndarray | None = None
         self.goals = 0
         self.scene: dict = {}
@@ -105,6 +108,7 @@ class Senses:
         topics.subscribe(String, 'scene', self._on_scene)
         topics.subscribe(String, 'labels/names', self._on_label_names)
         topics.subscribe(Image, 'goal_image', self._on_goal, anybody=True)
+        topics.subscribe(CameraInfo, 'goal_camera_info', self._on_goal_camera_info, anybody=True)
         # In lock-step no odometry may be missed, and the simulator is reliable.
         topics.subscribe(Odometry, 'odom', output.take_odometry, anybody=not lock_step)
         topics.subscribe(CameraInfo, 'camera_info', self._on_camera_info)
@@ -152,16 +156,20 @@ class Senses:
             if not self._goal_watch.is_new((stamp.sec, stamp.nanosec), content, time.monotonic()):
                 return
             self._navigator.new_goal()
-        picture = prepared(self._prepare, message, self._wake, self._refuse_goal)
+            self._goal_message = message
+        picture = prepared(self._prepare_goal, message, self._wake, self._refuse_goal)
         if picture is None:
             return
         with self._wake:
-            # Pictures up to then belong to the episode before.
-            self._navigator.accept_goal(_seconds(stamp) if self._lock_step else
-                                        self._now() + self._navigator.limits.settle_time)
-            self.goal, self.frame = picture, None
-            self.goals += 1
-            self._wake.notify_all()
+            self._take_goal(picture, message)
+
+    def _take_goal(self, picture: np.ndarray, message: Image) -> None:
+        # Pictures up to then belong to the episode before.
+        self._navigator.accept_goal(_seconds(message.header.stamp) if self._lock_step else
+                                    self._now() + self._navigator.limits.settle_time)
+        self.goal, self.frame = picture, None
+        self.goals += 1
+        self._wake.notify_all()
 
     def _refuse_goal(self, why: str) -> None:
         self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
@@ -216,6 +224,28 @@ class Senses:
             self._node.get_logger().error(shorten(str(error) or repr(error)),
                                           throttle_duration_sec=10.0)
 
+    def _on_goal_camera_info(self, message: CameraInfo) -> None:
+        try:
+            calibration = read_calibration(message)
+            if calibration is None:
+                return
+            camera = Camera(calibration, self._robot.camera_fov)
+        except Exception as error:  # as above
+            self._node.get_logger().error(
+                f'goal_camera_info refused: {shorten(str(error) or repr(error))}',
+                throttle_duration_sec=10.0)
+            return
+        stamp, goal = (message.header.stamp.sec, message.header.stamp.nanosec), self._goal_message
+        self._goal_camera = stamp, camera
+        # Topics are not in order: the picture may have come first.
+        if goal is not None and (goal.header.stamp.sec, goal.header.stamp.nanosec) == stamp:
+            picture = prepared(self._prepare_goal, goal, self._wake, self._refuse_goal)
+            with self._wake:
+                if picture is not None and self._navigator.goal_ready:
+                    self.goal = picture
+                elif picture is not None:  # by the robot's camera it was refused
+                    self._take_goal(picture, goal)
+
     def sees(self) -> bool:
         """Whether there is a picture to decide on, and what belongs to it."""
         return (self.frame is not None and self._navigator.wants(self.frame[0])
@@ -249,6 +279,13 @@ class Senses:
         smallest = camera.needed_side(self._size, self._robot.camera_fov)
         picture = camera.rectify(images.decode_rgb(message, smallest))
         return preprocess(picture, self._size, **self._lens())
+
+    def _prepare_goal(self, message: Image) -> np.ndarray:
+        stamp, other = self._goal_camera or (None, None)
+        if stamp != (message.header.stamp.sec, message.header.stamp.nanosec):
+            other = None
+        picture, fov = flatten_goal(images.decode_rgb(message), self.camera, other)
+        return preprocess(picture, self._size, fov=fov, target_fov=self._robot.camera_fov)
 
     def _lens(self) -> dict[str, float]:
         return {} if self.camera is None else {

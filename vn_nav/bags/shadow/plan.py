@@ -24,6 +24,7 @@ from vn_msgs_py.picture_file import DecodedPicture
 from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.drive import Report, find_topics
 from vn_nav.bags.drive_decoder import read_steps
+from vn_nav.bags.goal_cameras import GoalCameras, goal_stamp, read_goal_cameras
 from vn_nav.bags.roles import COMPRESSED, Topics, full_name
 from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.shadow.ranges import Ranges, RangesBeside, find_ranges
@@ -131,16 +132,19 @@ class Goals:
 
     Args:
         everywhere: where the bag shows none; None: the episode's last picture.
+        cameras: that took goals of the bag, where they are not the robot's.
 
     Attributes:
         shown: episodes with a goal of the bag.
         hindsight: episodes whose goal is their last picture.
     """
 
-    def __init__(self, everywhere: DecodedPicture | None = None):
+    def __init__(self, everywhere: DecodedPicture | None = None,
+                 cameras: GoalCameras | None = None):
         self._file = tempfile.TemporaryFile()
-        self._places: dict[int, tuple[int, tuple[int, ...]]] = {}  # by episode
-        self._everywhere = everywhere
+        # By episode: where the picture is, its shape, its field of view.
+        self._places: dict[int, tuple[int, tuple[int, ...], float | None]] = {}
+        self._everywhere, self._cameras = everywhere, cameras or {}
         self.shown = self.hindsight = 0
 
     def keep(self, episode: int, goal: object, last: object) -> None:
@@ -151,25 +155,27 @@ class Goals:
             goal: message that the bag shows; None: none.
             last: message of the episode's last picture.
         """
-        picture = None if goal is None else _picture(goal)
+        picture, fov = None if goal is None else _picture(goal), None
         self.shown += picture is not None
+        if picture is not None and (camera := self._cameras.get(goal_stamp(goal))) is not None:
+            picture, fov = camera.rectify(picture), camera.fov
         if picture is None and self._everywhere is None:
             picture = _picture(last)
             self.hindsight += picture is not None
         if picture is not None:
-            self._places[episode] = self._file.tell(), picture.shape
+            self._places[episode] = self._file.tell(), picture.shape, fov
             self._file.write(picture.tobytes())
 
     def picture(self, episode: int) -> DecodedPicture | None:
         """The goal; its field of view is None for the robot's own. None: it cannot be decoded."""
         if episode not in self._places:
             return self._everywhere
-        place, shape = self._places[episode]
+        place, shape, fov = self._places[episode]
         end = self._file.tell()
         self._file.seek(place)
         data = self._file.read(math.prod(shape))
         self._file.seek(end)
-        return DecodedPicture(np.frombuffer(data, np.uint8).reshape(shape), None)
+        return DecodedPicture(np.frombuffer(data, np.uint8).reshape(shape), fov)
 
 
 class _Clock:
@@ -230,7 +236,8 @@ def make_plan(bag: str | Path, robot: RobotSpec, topics: Topics,
         measured, depth_info = find_ranges(bag, find_topics(bag, kept), kept, ranges)
     steps, facts, lens = read_steps(bag, Wanted(robot, topics=wanted), report)
     decisions: list[Decision] = []
-    goals, done = Goals(goal), None
+    goals = Goals(goal, read_goal_cameras(bag, found, robot.camera_fov))
+    done = None
     for step in steps:
         frame = step.frame
         _check_times(bag, int(frame.time * 1e9), int(frame.stamp * 1e9))
