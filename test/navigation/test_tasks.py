@@ -42,6 +42,13 @@ def test_shaping_is_progress_and_contacts():
     assert np.allclose(reward, [1.0, -0.6])
 
 
+@pytest.mark.parametrize('progress', [0.0, 2.0])
+def test_a_distance_that_nobody_knows_is_no_progress(progress):
+    reward = tasks.shaping_reward(np.array([np.inf, np.inf, 1.0]), np.array([2.5, np.inf, np.nan]),
+                                  np.array([False, True, False]), progress=progress, collision=-0.1)
+    assert np.allclose(reward, [0.0, -0.1, 0.0])
+
+
 def test_a_room_is_seen_when_its_objects_fill_a_share_of_the_picture():
     labels = np.zeros((2, 20, 20), np.uint8)
     labels[0, 0, :18] = LABEL['toilet']  # 4.5 %

@@ -47,7 +47,11 @@ class FloorDistance:
         return float(self.values[np.isfinite(self.values)].max())
 
     def at(self, xy: np.ndarray) -> np.ndarray:
-        """Distance of positions [N,>=2] to the point [m]; inf where it cannot be reached."""
+        """Distance of positions [N,>=2] to the point [m].
+
+        Cells miss a gap that is hardly wider than the robot: behind it, as close to furniture, the
+        way to the nearest cell that is reached is taken to be straight.
+        """
         return interpolate(self.values[None], np.zeros(len(xy), np.int64),
                            (xy[:, 0] - self.floor.origin[0]) / CELL - 0.5,
                            (xy[:, 1] - self.floor.origin[1]) / CELL - 0.5)
@@ -111,7 +115,8 @@ def _fast_sweeping(free, t):
 def interpolate(stack, which, columns, rows):
     """Distances [K] at fractional cells, from maps `which` [K] of a stack [G,rows,columns].
 
-    Bilinear where all four neighbours are free, else the best detour over a free neighbour.
+    Bilinear where all four neighbours are reached, else over one near by that is; inf where no
+    cell of the map is.
     """
     height, width = stack.shape[1:]
     out = np.empty(len(columns))
@@ -126,10 +131,10 @@ def interpolate(stack, which, columns, rows):
                 u, v = x - j, y - i
                 out[n] = (a * (1 - u) + b * u) * (1 - v) + (c * (1 - u) + d * u) * v
                 continue
-        # Off the free cells (close to furniture): over the nearest of them, searched outwards.
+        # Off those cells: over the nearest of them, searched outwards.
         best = np.inf
         ring = 2
-        while best == np.inf and ring < 32:
+        while best == np.inf and ring < 2 * (height + width):
             for p in range(max(0, i - ring), min(height, i + ring + 2)):
                 for q in range(max(0, j - ring), min(width, j + ring + 2)):
                     if values[p, q] < np.inf:

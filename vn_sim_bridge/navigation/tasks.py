@@ -69,12 +69,15 @@ def shaping_reward(before, after, collided, success=False, *, progress: float, c
     """Optional terms beside the sparse reward; they never reach the network.
 
     Args:
-        before, after: geodesic distance to the goal around the decision [m].
+        before, after: geodesic distance to the goal around the decision [m]; where one of them is
+            not finite, nothing is known of the progress.
         collided: [N] bool; success: [N] bool.
         progress: reward per metre of progress; collision: reward of a contact (negative).
         step: of a decision that does not reach the goal; goal: of one that does.
     """
-    return (progress * (before - after) + collision * collided
+    known = np.isfinite(before) & np.isfinite(after)
+    gained = np.where(known, before, 0.0) - np.where(known, after, 0.0)
+    return (progress * gained + collision * collided
             + np.where(success, goal, step)).astype(np.float32)
 
 

@@ -74,7 +74,7 @@ def distance_at(houses: Houses, house: int, goal: int, px: wp.float64, py: wp.fl
                     + (_f64(c) * (one - u) + _f64(d) * u) * v)
     best = _infinity
     ring = int(2)
-    while best == _infinity and ring < 32:
+    while best == _infinity and ring < 2 * (height + width):
         for p in range(wp.max(0, i - ring), wp.min(height, i + ring + 2)):
             for q in range(wp.max(0, j - ring), wp.min(width, j + ring + 2)):
                 value = houses.maps[goal, p, q]
