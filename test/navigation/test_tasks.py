@@ -45,7 +45,8 @@ def test_shaping_is_progress_and_contacts():
 @pytest.mark.parametrize('progress', [0.0, 2.0])
 def test_a_distance_that_nobody_knows_is_no_progress(progress):
     reward = tasks.shaping_reward(np.array([np.inf, np.inf, 1.0]), np.array([2.5, np.inf, np.nan]),
-                                  np.array([False, True, False]), progress=progress, collision=-0.1)
+                                  np.array([False, True, False]), progress=progress,
+                                  collision=-0.1)
     assert np.allclose(reward, [0.0, -0.1, 0.0])
 
 

@@ -12,6 +12,8 @@ import time
 import numpy as np
 import pytest
 import rclpy
+from browser import CHROMIUM, Browser
+from dashboard_client import dashboard, live, post
 from joystick_drive import drive, write_bag
 from nav_msgs.msg import Odometry
 from paths import ROOT
@@ -169,6 +171,57 @@ def test_a_person_stops_it(way, tmp_path):
         node.send_signal(signal.SIGINT)
         assert node.wait(PATIENCE) == 0
         assert watch.until('cancelled')['error_msg'] == 'route_node ended'
+
+
+def test_a_page_in_the_browser_drives_along_it(way, tmp_path):
+    folder, _ = way
+    named = command('route', folder, '--name', 'kitchen=2', '--name', 'desk=first')
+    assert named.wait(PATIENCE) == 0
+    with child('vn_sim_bridge.bridge_node', tmp_path / 'bridge', house=HOUSE, rooms=ROOMS,
+               time='lock_step', free_driving=True), \
+            child('vn_nav.nodes.policy_node', tmp_path / 'policy', time='lock_step',
+                  checkpoint=ROOT / 'models' / 'search', use_sim_time=True, stop_threshold=1.0), \
+            dashboard(tmp_path / 'log') as (address, _):
+        def until(condition):
+            return live(address, lambda message: isinstance(message, dict) and condition(
+                message['route']))[-1]['route']
+        until(lambda route: route is None)
+        code, said = post(f'{address}place', b'kitchen')
+        assert code == 200 and not said['done'] and 'route_node' in said['message']
+        with child(NODE, tmp_path / 'route', route=folder, use_sim_time=True) as node:
+            until(lambda route: route and 'kitchen' in route['places'])
+            for wrong in (b'bath', b'\xff'):
+                assert not post(f'{address}place', wrong)[1]['done']
+            assert post(f'{address}place', b'kitchen', Origin='http://evil.example')[0] == 403
+            assert post(f'{address}place', b'kitchen')[1]['done']
+            live(address, lambda message: isinstance(message, dict) and (
+                message['goal']['status'], message['route']['place']) == ('active', 'kitchen'))
+            assert post(f'{address}stop')[1]['done']
+            until(lambda route: route['status'] == 'cancelled')
+            # What a person has stopped only a person sets going.
+            assert post(f'{address}place', b'desk')[1]['done']
+            ended = until(lambda route: route['status'] == 'failed')
+            assert ended['place'] == 'desk' and 'reset' in ended['error_msg']
+            assert post(f'{address}reset')[1]['done']
+            if CHROMIUM is not None:
+                drive_by_page(address, tmp_path)
+            node.send_signal(signal.SIGINT)
+            assert node.wait(PATIENCE) == 0
+            until(lambda route: route is None)
+
+
+def drive_by_page(address, tmp_path):
+    """Click on a place, and on Stop."""
+    with Browser(tmp_path / 'profile', address) as page:
+        page.wait_for('document.querySelectorAll("#places button").length == 2')
+        page.click('#places button:first-child')
+        page.wait_for('document.getElementById("route_status").textContent.startsWith('
+                      '"drives to kitchen; shows picture ")')
+        assert page.value('document.querySelector("#places .chosen").textContent') == 'kitchen'
+        page.click('#stop')
+        page.wait_for('document.getElementById("route_status").textContent.startsWith('
+                      '"to kitchen cancelled")')
+        assert not page.errors, page.errors
 
 
 def test_what_fails_is_said(way, tmp_path):

@@ -59,6 +59,9 @@ class Robot(Protocol):
     def ask(self, name: str) -> tuple[bool, str]:
         """Of the policy: enable, stop or reset; whether it did, and what it says."""
 
+    def drive_to(self, place: str) -> tuple[bool, str]:
+        """Along the route, to a place by its name; whether that was asked, and what is said."""
+
     def show_file(self, path: Path) -> str:
         """Show it a goal from a file; what was shown. Raises `UserError`."""
 
@@ -79,7 +82,7 @@ def application(robot: Robot, access: Access, *, camera_rate: float = 5.0) -> we
     app.add_routes([
         web.get('/', server.page), web.get('/live', server.live), web.get('/bag', server.bag),
         web.get('/bag/{number}.jpg', server.thumbnail), web.post('/goal', server.upload),
-        web.post('/goal/{number}', server.choose),
+        web.post('/goal/{number}', server.choose), web.post('/place', server.place),
         *(web.post(f'/{name}', server.act) for name in ('enable', 'stop', 'reset')),
         *(web.get(f'/{name}', server.file) for name in FILES)])
     return app
@@ -157,6 +160,15 @@ class _Server:
     async def act(self, request: web.Request) -> web.Response:
         """Enable, stop, reset."""
         done, said = await asyncio.to_thread(self._robot.ask, request.path.lstrip('/'))
+        return web.json_response({'done': done, 'message': said})
+
+    async def place(self, request: web.Request) -> web.Response:
+        """A place of the route: the body is its name."""
+        try:
+            place = (await request.read()).decode()
+        except ValueError:
+            return _refused('the name of a place is UTF-8')
+        done, said = await asyncio.to_thread(self._robot.drive_to, place)
         return web.json_response({'done': done, 'message': said})
 
     async def upload(self, request: web.Request) -> web.Response:

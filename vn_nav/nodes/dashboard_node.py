@@ -1,8 +1,8 @@
-"""`dashboard_node`: a page in the browser: camera, goal, map, state; enable, and stop.
+"""`dashboard_node`: a page in the browser: camera, goal, map, state, places; enable, and stop.
 
 Run: `ros2 run vn_nav dashboard_node`, beside policy_node, and open the address that it prints. It
 serves this machine alone unless it is told another host, and then only who has its token. Nothing
-on the page comes from elsewhere. It publishes no command: it asks policy_node.
+on the page comes from elsewhere. It publishes no command: it asks policy_node, and route_node.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from vn_nav.nodes.goal_publisher import GoalPublisher
 from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos, subscribe
 from vn_nav.nodes.service_call import ServiceCall
+from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.search.snapshot import snapshot_of
 from vn_nav.report.search_map import Window, draw, known_bounds
 
@@ -85,6 +86,7 @@ class DashboardNode(Node):
         self._status: tuple[float, Any] | None = None  # steady time, and DiagnosticStatus
         self._goal_status: dict[str, Any] = {}
         self._feedback: dict[str, Any] = {}
+        self._route: dict[str, Any] | None = None  # what route_node says; None: there is none
         self._picture: tuple[int, Any] | None = None
         self._goal_image: tuple[int, Any] | None = None
         self._map: Any = None
@@ -93,12 +95,15 @@ class DashboardNode(Node):
         self._drawn: tuple[tuple, int] = ((), 0)  # what the newest map shows, and its number
         self._watching: list[Subscription] = []
         self._goals = GoalPublisher(self)
+        self._place = self.create_publisher(String, 'route_goal', qos('route_goal'))
         self._asked = {name: self.create_client(kind, f'{policy}/{name}')
                        for name, (kind, _) in SERVICES.items()}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_status,
                                  qos('/diagnostics'))
         self.create_subscription(String, 'goal_status', self._on_goal_status, qos('goal_status'))
         self.create_subscription(String, 'goal_feedback', self._on_feedback, qos('goal_feedback'))
+        self._hears_route = self.create_subscription(String, 'route_status', self._on_route,
+                                                     qos('route_status'))
         for name, kind, callback in (('odom', Odometry, self._on_odometry),
                                      ('goal_image', Image, self._on_goal)):
             subscribe(self, kind, name, callback)
@@ -121,6 +126,8 @@ class DashboardNode(Node):
             for subscription in self._watching:
                 self.destroy_subscription(subscription)
             self._watching = []
+        if self._route is not None and not self.count_publishers(self._hears_route.topic_name):
+            self._route = None
 
     def _on_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -135,6 +142,9 @@ class DashboardNode(Node):
 
     def _on_feedback(self, message: String) -> None:
         self._feedback = json.loads(message.data)
+
+    def _on_route(self, message: String) -> None:
+        self._route = json.loads(message.data)
 
     def _on_picture(self, message: Any) -> None:
         self._picture = (0 if self._picture is None else self._picture[0]) + 1, message
@@ -179,6 +189,7 @@ class DashboardNode(Node):
                      'decisions': feedback.get('decisions', 0),
                      'arrival': feedback.get('arrival'),
                      'distance': feedback.get('distance_remaining')},
+            'route': self._route,
             'values': {title: known[key] for key, title in SHOWN.items() if key in known}}
 
     def camera(self) -> tuple[int, bytes] | None:
@@ -216,6 +227,16 @@ class DashboardNode(Node):
             time.sleep(0.01)
         return False, (f'{self._policy} does not answer to {name}' + (
             ": use the robot's own stop" if name == 'stop' else ''))
+
+    def drive_to(self, place: str) -> tuple[bool, str]:
+        """See `dashboard.server.Robot`."""
+        if self._route is None or not self._place.get_subscription_count():
+            return False, ('no route_node listens: ros2 run vn_nav route_node --ros-args '
+                           '-p route:=FOLDER')
+        if place not in self._route['places']:
+            return False, f'the route has no place of the name {shorten(place)!r}'
+        self._place.publish(String(data=place))
+        return True, f'asked to drive to {place}'
 
     def show_file(self, path: Path) -> str:
         """See `dashboard.server.Robot`."""

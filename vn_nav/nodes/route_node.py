@@ -31,6 +31,7 @@ from vn_nav.nodes.qos import qos, subscribe
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_record import Code
+from vn_nav.policy.navigator import RESET_FIRST
 from vn_nav.policy.runtime import PolicyRuntime
 from vn_nav.resources import share_file
 from vn_nav.routes.follower import RouteFollower
@@ -217,6 +218,7 @@ class RouteNode(Node):
             answered = self._enable.service_is_ready() and self._enables.is_answered()
             if answered and not self._enables.answer.success:
                 self._message = self._enables.answer.message
+                late = late or RESET_FIRST in self._message  # a person's to do
                 self._enables = self._allow()  # frames have to be healthy for a second
             if late:
                 self._cancel(f'motion was not enabled: '

@@ -28,6 +28,7 @@ from vn_nav.policy.motion import ActionExecutor, cruise, ramp
 from vn_nav.robot import RobotSpec
 
 STOP_SECONDS = 1.0  # how long a stop repeats its zero before it falls silent
+RESET_FIRST = 'call ~/reset first'  # in the refusal to enable what was stopped
 ARMING_SECONDS = 1.0  # of healthy frames before `enable` is granted
 
 
@@ -205,7 +206,7 @@ class Navigator:
         """
         missing = list(blockers)
         if self.state is State.STOPPED:
-            missing.append(f'stopped ({self.reason}): call ~/reset first')
+            missing.append(f'stopped ({self.reason}): {RESET_FIRST}')
         if not self.goal_ready:
             missing.append('no usable goal: publish a picture on goal_image'
                            + (f' ({self.goal_refusal})' if self.goal_refusal else ''))

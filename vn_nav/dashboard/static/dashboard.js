@@ -3,7 +3,7 @@ const $ = (name) => document.getElementById(name);
 const KINDS = {1: 'camera', 2: 'goal', 3: 'map'};
 const LEVELS = ['ok', 'warn', 'error', 'error'];
 const OLD_MS = 3000;  // without word from the server
-let heard = 0, curve = [], ofGoal = null, bag = null, received = [];
+let heard = 0, curve = [], ofGoal = null, bag = null, received = [], places = '';
 
 function say(text, good) {
   $('said').textContent = text;
@@ -59,12 +59,41 @@ function tell(state) {
   draw();
   $('arrival').textContent = goal.arrival === null ? '' : goal.arrival.toFixed(2);
   $('distance').textContent = goal.distance === null ? '' : `goal ${goal.distance.toFixed(1)} m away`;
+  tellRoute(state.route);
   $('values').replaceChildren(...Object.entries(state.values).flatMap(([name, value]) => {
     const [dt, dd] = ['dt', 'dd'].map((tag) => document.createElement(tag));
     dt.textContent = name;
     dd.textContent = value;
     return [dt, dd];
   }));
+}
+
+function tellRoute(route) {
+  $('route').hidden = !route;
+  if (!route) { places = ''; return; }
+  const names = Object.keys(route.places), drives = ['locating', 'active'].includes(route.status);
+  if (JSON.stringify(names) !== places) {
+    places = JSON.stringify(names);
+    const none = document.createElement('p');
+    none.className = 'empty';
+    none.textContent = 'No place has a name: vn_nav route FOLDER --name kitchen=12';
+    $('places').replaceChildren(...names.length ? names.map((name) => {
+      const button = document.createElement('button');
+      button.textContent = name;
+      button.addEventListener('click', () => ask('place', name));
+      return button;
+    }) : [none]);
+  }
+  [...$('places').children].forEach((button) => button.classList.toggle(
+    'chosen', drives && button.textContent === route.place));
+  const to = route.place ? `to ${route.place}` : '';
+  $('route_status').textContent = [
+    {none: '', locating: `${to}: looks where it is`, active: `drives ${to}`,
+      succeeded: `arrived at ${route.place}`, failed: `${to} failed`,
+      cancelled: `${to} cancelled`}[route.status],
+    route.error_msg,
+    drives && route.shown !== null ? `shows picture ${route.shown}` : '',
+    route.here !== null ? `nearest: ${route.here}` : ''].filter(Boolean).join('; ');
 }
 
 function connect() {
