@@ -8,6 +8,7 @@ from ros_harness import write_checkpoint
 
 from vn_nav.cli import main
 from vn_nav.evaluation.bag_episodes import drives_from_bag
+from vn_nav.report.trial_page import section
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(240)]  # drives over ROS
 
@@ -15,7 +16,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(240)]  # dr
 def test_both_bases_are_driven_once_and_counted_from_their_bags(tmp_path, capsys):
     sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
     words = ['drive-trial', '--out', str(tmp_path / 'out'), '--checkpoint', str(sure),
-             '--scene', 'house:7?rooms=2', '--episodes', '2', '--set', 'settle_time=0.2']
+             '--scene', 'house:7?rooms=2', '--episodes', '2', '--set', 'settle_time=0.2',
+             '--keep', str(tmp_path / 'trial.json')]
     assert main(words) == 0
     result = json.loads((tmp_path / 'out' / 'result.json').read_text())
     assert list(result['bases']) == ['ideal', 'harsh'] and len(result['success_difference']) == 3
@@ -31,6 +33,12 @@ def test_both_bases_are_driven_once_and_counted_from_their_bags(tmp_path, capsys
     assert starts[0] == starts[1]
     page = (tmp_path / 'out' / 'page.html').read_text()
     assert page.count('<svg') == 2 and 'false stop' in page and '<script' not in page
+    trial = json.loads((tmp_path / 'trial.json').read_text())
+    (scene,) = trial['scenes']
+    assert trial['result'] == result and len(scene['drives']) == 2
+    assert scene['drives'][0]['way'][0] == pytest.approx(starts[1][0][:2], abs=0.02)
+    shown = section(trial)
+    assert shown.count('<svg') == 2 and 'false stop' in shown and result['date'] in shown
     begun = time.monotonic()
     assert main(words) == 0
     assert time.monotonic() - begun < 10, 'nothing is driven again'
@@ -38,7 +46,8 @@ def test_both_bases_are_driven_once_and_counted_from_their_bags(tmp_path, capsys
 
 
 @pytest.mark.parametrize('words, what', [
-    (['--episodes', '0'], '--episodes'), (['--set', 'nonsense=1'], 'nonsense'),
+    (['--episodes', '0'], '--episodes'),
+    (['--bases', 'ideal', '--keep', 'x.json'], '--keep'), (['--set', 'nonsense=1'], 'nonsense'),
     (['--set', 'settle_time=long'], 'settle_time'), (['--set', 'settle_time=9'], 'settle_time')])
 def test_bad_options_are_one_line(tmp_path, capsys, words, what):
     assert main(['drive-trial', '--out', str(tmp_path / 'out'), *words]) == 2

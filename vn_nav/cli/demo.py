@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from vn_nav.nodes.demo_watch import EndedEpisode
 
 ONE_HOUSE, ANY_HOUSE = 'models/house', 'models/search'  # the shipped policies
+TRIAL = 'trial.json'  # beside the second: what `vn_nav drive-trial --keep` wrote of it
 LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode; the second for a policy of one house
 UNSEEN_HOUSE = 11_000  # seed, of the split test: no shipped policy has seen it
 SEED = 2026  # of starts, goals and light
@@ -139,7 +140,9 @@ def demonstrate(out: Path, folder: Path | None = None, *, episodes: int = 20,
     result = _results(drives, stages)
     result |= {'seconds': round(time.monotonic() - begun, 1), 'bag': 'bag', 'html': 'report.html',
                'date': datetime.date.today().isoformat()}
-    write_report(out / 'report.html', drives, result)
+    trial = share_file(ANY_HOUSE) / TRIAL
+    write_report(out / 'report.html', drives, result, json.loads(trial.read_text())
+                 if folder is None and scene is None and trial.is_file() else None)
     result['seconds'] = round(time.monotonic() - begun, 1)
     (out / 'result.json').write_text(json.dumps(result, indent=2) + '\n')
     _show(console, result, out)

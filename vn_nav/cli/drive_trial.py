@@ -89,6 +89,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='a '
                         'parameter of policy_node on the harsh base, such as settle_time=0.4; may '
                         'be given several times')
+    parser.add_argument('--keep', type=Path, metavar='JSON', help='write what the page of the '
+                        'demo shows of it, as models/search/trial.json')
     parser.add_argument('--jobs', type=int, default=1, help='scenes side by side, two cores each '
                         'where they are there (default 1)')
 
@@ -103,8 +105,11 @@ def run(args: argparse.Namespace) -> int:
     from vn_nav.files import write_file
     from vn_nav.nodes.isolation import stay_on_this_host
     from vn_nav.report.terminal import print_table
-    from vn_nav.report.trial_page import trial_page
+    from vn_nav.report.trial_page import kept, trial_page
     from vn_nav.resources import share_file
+    if args.keep and 'harsh' not in args.bases:
+        raise UserError('--keep keeps the ways of the harsh base', args.bases,
+                        'leave out --bases, or --keep')
     for name, value in (('--episodes', args.episodes), ('--jobs', args.jobs),
                         ('--scenes', args.scenes), ('--max-decisions', args.max_decisions)):
         if value < 1:
@@ -131,9 +136,11 @@ def run(args: argparse.Namespace) -> int:
         'max_decisions': args.max_decisions, 'parameters': extra, 'machine': machine(),
         'date': datetime.date.today().isoformat()}
     write_file(args.out / RESULT, (json.dumps(result, indent=2) + '\n').encode())
-    write_file(args.out / PAGE, trial_page(
-        result, {base: BASES[base].about for base in args.bases},
-        {base: driver.drives(legs, base) for base in args.bases}).encode())
+    about = {base: BASES[base].about for base in args.bases}
+    drives = {base: driver.drives(legs, base) for base in args.bases}
+    write_file(args.out / PAGE, trial_page(result, about, drives).encode())
+    if args.keep:
+        write_file(args.keep, (json.dumps(kept(result, about, drives)) + '\n').encode())
     print_table(f'{args.episodes} episodes of each base, over ROS 2', *_cells(result))
     print(args.out / PAGE)
     return 0

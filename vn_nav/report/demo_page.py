@@ -16,6 +16,7 @@ from vn_nav.report.maps import Journey, floor_map
 from vn_nav.report.page import cards, page, picture, table
 from vn_nav.report.search_map import Window, draw, known_bounds
 from vn_nav.report.tables import number
+from vn_nav.report.trial_page import section
 from vn_nav.scenes import HOUSE, parse_scene
 
 STRIP = 9  # pictures of a film strip
@@ -32,23 +33,25 @@ def kind_of(scene: str) -> str:
     return 'house' if parse_scene(scene).simulator == HOUSE else 'scene'
 
 
-def write_report(path: Path, drives: list[Drive], result: dict) -> None:
+def write_report(path: Path, drives: list[Drive], result: dict, trial: dict | None = None) -> None:
     """Write the page.
 
     Args:
         path: of the HTML file.
         drives: one a place of the figures, trained before unseen; with pictures.
         result: the figures, as in result.json.
+        trial: that was driven before, see `trial_page.kept`; None: none was.
     """
     places = [(place, drive) for place, drive in zip(
         (name for name in TITLES if name in result), drives, strict=True)]
     body = ''.join(_place(place, drive, result[place]) for place, drive in places)
     path.write_text(page('vn_nav demo', f"""
 <h1>Show a robot a picture, and it drives there</h1>
-<p class="soft">Every figure on this page was counted from the ROS 2 bag of one run: simulator and
+<p class="soft">Every figure of the demo was counted from the ROS 2 bag of one run: simulator and
 policy were two processes that met on ROS topics alone. The policy saw the camera, the goal picture
 and its own last action; no true pose, no depth, no map of the house.</p>
 {body}
+{'' if trial is None else section(trial)}
 <h2>Definitions</h2><dl>{_declared_stop([result[place] for place, _ in places])}
 <dt>Success</dt><dd>At the end of a decision the robot stands within {ARRIVAL_RADIUS:g} m of the
 place (driving distance) and faces within {math.degrees(ARRIVAL_HEADING):g} degrees of the

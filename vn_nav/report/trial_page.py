@@ -1,17 +1,28 @@
-"""The page of `vn_nav drive-trial`: an ideal base and a harsh one, on the same starts."""
+"""The page of `vn_nav drive-trial`: an ideal base and a harsh one, on the same starts.
+
+A trial takes hours. What is kept of it with the policy (`kept`) makes a part of the demo's page
+(`section`).
+"""
 
 from __future__ import annotations
 
 import html
 import math
 
+import numpy as np
+
 from vn_nav import __version__
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.evaluation.bag_episodes import Drive
+from vn_nav.evaluation.metrics import Episode
 from vn_nav.report.maps import Journey, floor_map
 from vn_nav.report.page import page, table
 from vn_nav.report.tables import number
 
+STEP_M = 0.1  # between two kept places of a way
+SHOWN = 10  # ways in a part of another page
+# What a floor map is drawn of.
+PLAN = 'scene', 'bounds', 'walls', 'outside', 'obstacles', 'rooms_list'
 
 def trial_page(result: dict, about: dict[str, str], drives: dict[str, list[Drive]]) -> str:
     """The page.
@@ -45,6 +56,56 @@ nine of ten keep within.</dd><dt>Collisions</dt><dd>Share of decisions that touc
 something.</dd><dt>Interventions</dt><dd>Stops that policy_node latched (a silent camera, say), and
 that the trial reset.</dd></dl>
 <p class="soft">vn_nav {__version__}, {html.escape(result['machine'])}, {result['date']}.</p>""")
+
+
+def kept(result: dict, about: dict[str, str], drives: dict[str, list[Drive]]) -> dict:
+    """What stays of a trial, for JSON: figures, floors, ways of some cm.
+
+    Args:
+        result, about, drives: see `trial_page`.
+    """
+    return {'result': result, 'about': about, 'scenes': [{
+        'plan': {name: drive.scene[name] for name in PLAN if name in drive.scene},
+        'drives': [{'success': one.episode.success, 'outcome': _said(one.episode),
+                    'goal': [round(value, 2) for value in one.facts['goal_pose'][:3]],
+                    'decisions': one.episode.decisions, 'seconds': round(one.episode.seconds),
+                    'way': _thinned(one.trajectory).round(2).tolist()}
+                   for one in drive.episodes]}
+        for drive in drives.get('harsh', ())]}
+
+
+def _thinned(trajectory: np.ndarray) -> np.ndarray:
+    """Places [K,2] along a way, `STEP_M` apart, and its end."""
+    places = [trajectory[0, :2]]
+    for place in trajectory[1:, :2]:
+        if math.dist(place, places[-1]) >= STEP_M:
+            places.append(place)
+    return np.array([*places, trajectory[-1, :2]])
+
+
+def section(trial: dict) -> str:
+    """A part of another page: the table, and the ways of the harsh base.
+
+    Args:
+        trial: of `kept`.
+    """
+    result, shown = trial['result'], []
+    for scene in trial['scenes']:
+        if 'bounds' not in scene['plan']:
+            continue
+        for one in scene['drives'][:max(SHOWN // len(trial['scenes']), 1)]:
+            way = np.array(one['way'])
+            drawn = floor_map(scene['plan'], [Journey(way, one['success'])], [one['goal']])
+            colour = 'yes' if one['success'] else 'no'
+            shown.append(f'<figure>{drawn}<figcaption>{html.escape(scene["plan"]["scene"])}: '
+                         f'<span class="{colour}">{one["outcome"]}</span> after '
+                         f'{one["decisions"]} decisions, {one["seconds"]} s</figcaption></figure>')
+    return f"""<h2>On a base that is late and slips</h2>
+<p class="soft">Not of this run: <code>vn_nav drive-trial</code> drove these, {result['date']},
+{html.escape(result['machine'])}, in houses that no training saw. The harsh base
+{html.escape(trial['about']['harsh'])}</p>
+{_compared(result['bases'])}{_difference(result)}
+<div class="maps">{''.join(shown[:SHOWN])}</div>"""
 
 
 def _difference(result: dict) -> str:
@@ -97,10 +158,12 @@ def _scene(drives: dict[str, Drive]) -> str:
             f'<details><summary>Episodes</summary>{table(heads, rows, text=3)}</details>')
 
 
-def _outcome(episode) -> str:
-    if episode.success:
-        return '<span class="yes">arrived</span>'
-    return f'<span class="no">{"false stop" if episode.declared else "gave up"}</span>'
+def _outcome(episode: Episode) -> str:
+    return f'<span class="{"yes" if episode.success else "no"}">{_said(episode)}</span>'
+
+
+def _said(episode: Episode) -> str:
+    return 'arrived' if episode.success else 'false stop' if episode.declared else 'gave up'
 
 
 def _map(drive: Drive) -> str:
