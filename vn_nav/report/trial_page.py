@@ -24,6 +24,7 @@ SHOWN = 10  # ways in a part of another page
 # What a floor map is drawn of.
 PLAN = 'scene', 'bounds', 'walls', 'outside', 'obstacles', 'rooms_list'
 
+
 def trial_page(result: dict, about: dict[str, str], drives: dict[str, list[Drive]]) -> str:
     """The page.
 
