@@ -20,6 +20,8 @@ def test_the_frame_curriculum_follows_the_thesis():
         taus.append(curriculum.tau)
     assert taus == pytest.approx([0.3, 0.3, 0.65, 1.0, 1.0])
     assert not curriculum.update([], np.zeros(1), 1.0)
+    first = FrameCurriculum(begin=2.5, end=5.0)  # the thesis's first 2e6 frames
+    assert not first.update([], np.zeros(1), 1.0) and first.tau == 0.3
     other = FrameCurriculum()
     other.load_state_dict(curriculum.state_dict())
     assert other.tau == 1.0

@@ -94,6 +94,9 @@ class TrainConfig(LearnerConfig):
     extra_heads: tuple[str, ...] = ()
     curriculum: str = 'success'  # or 'frames': what raises the difficulty
     start_difficulty: float = 0.3  # tau of the curriculum; 1 switches it off
+    # Of 'frames': shares of the training between which tau grows; beyond 1 it does not get there.
+    curriculum_begin: float = 0.125
+    curriculum_end: float = 0.25
     success_to_advance: float = 0.75
     difficulty_step: float = 0.1
     advance_window: int = 200  # episodes
@@ -118,6 +121,8 @@ class TrainConfig(LearnerConfig):
              self.curriculum),
             (0 < self.start_difficulty <= 1, 'start_difficulty lies in (0, 1]',
              self.start_difficulty),
+            (0 <= self.curriculum_begin < self.curriculum_end,
+             'the curriculum begins before it ends', (self.curriculum_begin, self.curriculum_end)),
             (self.difficulty_step > 0, 'difficulty_step is positive', self.difficulty_step),
             (self.advance_window >= 1, 'advance_window is positive', self.advance_window),
             (self.pair_minutes == 0 or (self.pair_minutes > 0 and 'goal_pose' in self.tasks),

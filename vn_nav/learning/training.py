@@ -97,7 +97,9 @@ class Training:
         self.collector = Collector(env, self.actor, self.drawn, config.privileged)
         self.curriculum: Curriculum | FrameCurriculum
         if config.curriculum == 'frames':
-            self.curriculum = FrameCurriculum(start=config.start_difficulty)
+            self.curriculum = FrameCurriculum(
+                start=config.start_difficulty, begin=config.curriculum_begin,
+                end=config.curriculum_end)
         else:
             self.curriculum = Curriculum(
                 env.num_envs * processes.count, start=config.start_difficulty,
