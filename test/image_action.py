@@ -37,11 +37,12 @@ def send(node, client, wanted):
         goal, feedback_callback=lambda message: heard.append(message.feedback)))
     if not handle.accepted:
         return {'accepted': False}
-    future = handle.get_result_async()
+    future, other = handle.get_result_async(), None
+    if 'interrupted_by' in wanted:
+        until(node, wanted['after'])
+        other = send(node, client, wanted['interrupted_by'])
     if 'cancel_after' in wanted:
-        end = time.monotonic() + wanted['cancel_after']
-        while time.monotonic() < end:
-            rclpy.spin_once(node, timeout_sec=0.05)
+        until(node, wanted['cancel_after'])
         wait(handle.cancel_goal_async())
     answer = wait(future)
     result = answer.result
@@ -50,7 +51,15 @@ def send(node, client, wanted):
             'arrival': None if math.isnan(result.arrival) else result.arrival,
             'seconds': result.navigation_time.sec + 1e-9 * result.navigation_time.nanosec,
             'states': list(dict.fromkeys(each.state for each in heard)),
+            'other': other,
             'distance_known': any(not math.isnan(each.distance_remaining) for each in heard)}
+
+
+def until(node, seconds):
+    """Spin for a while."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        rclpy.spin_once(node, timeout_sec=0.05)
 
 
 def main():

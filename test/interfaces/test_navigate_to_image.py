@@ -148,15 +148,22 @@ def test_goals_of_the_action_arrive_fail_and_are_cancelled(built, robot, tmp_pat
     cv2.imwrite(str(picture), np.zeros((84, 84, 3), np.uint8))
     with child('vn_nav.nodes.policy_node', tmp_path / 'log',
                checkpoint=write_checkpoint(tmp_path / 'unsure'), **PATIENT):
-        used_up, none, cancelled = results(robot, built, [
-            {'max_decisions': 2}, {'path': str(tmp_path / 'none.png')}, {'cancel_after': 4.0}])
+        nowhere = {'path': str(tmp_path / 'none.png')}
+        used_up, none, cancelled, replaced = results(robot, built, [
+            {'max_decisions': 2}, nowhere, {'cancel_after': 4.0},
+            {'interrupted_by': nowhere, 'after': 4.0}])
+        # The goal before is over: the robot has none, and stands.
         robot.wait_for_zero()
+        robot.spin_for(1.0)
+        assert not robot.moving()
     assert (used_up['status'], used_up['code'], used_up['decisions']) == (
         ABORTED, Code.BUDGET, 2), used_up
     assert used_up['seconds'] > 0 and 'running' in used_up['states']
     assert (none['status'], none['code']) == (ABORTED, Code.GOAL_REFUSED)
     assert 'no such file' in none['message']
     assert (cancelled['status'], cancelled['code']) == (CANCELED, 0)
+    assert (replaced['status'], replaced['code']) == (ABORTED, Code.STOPPED), replaced
+    assert replaced['other']['code'] == Code.GOAL_REFUSED
     sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
     with child('vn_nav.nodes.policy_node', tmp_path / 'log2', checkpoint=sure, **PATIENT):
         (there,) = results(robot, built, [{'path': str(picture)}])

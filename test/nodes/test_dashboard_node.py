@@ -10,10 +10,15 @@ import aiohttp
 import cv2
 import numpy as np
 import pytest
+import rclpy
 from browser import CHROMIUM, Browser
 from dashboard_client import dashboard, live, post, status, wait_until
 from paths import ROOT
+from rclpy.duration import Duration
 from ros_harness import PATIENCE, child, write_checkpoint
+from std_msgs.msg import String
+
+from vn_nav.nodes.qos import qos
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(240)]
 BAG = ROOT / 'bags' / 'house_drive'
@@ -96,6 +101,25 @@ def test_on_other_addresses_a_token_is_shown_once(tmp_path):
         assert time.monotonic() - begun < 10
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE) == 0
+
+
+def test_what_somebody_else_says_leaves_the_page_alive(tmp_path):
+    rclpy.init()
+    node = rclpy.create_node('stranger')
+    try:
+        with dashboard(tmp_path / 'log', policy='nobody') as (address, _):
+            for name in ('goal_status', 'goal_feedback', 'route_status'):
+                publisher = node.create_publisher(String, name, qos(name))
+                wait_until(publisher.get_subscription_count)
+                for text in ('hello', '[]', '3', '{}'):
+                    publisher.publish(String(data=text))
+                assert publisher.wait_for_all_acked(Duration(seconds=20))
+            wait_until(lambda: 'is JSON with' in (tmp_path / 'log').read_text())
+            assert live(address, lambda _: True)[-1]['state'] == 'no policy'
+            assert post(f'{address}stop')[0] == 200
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 @pytest.mark.parametrize('words, what', [

@@ -1,6 +1,7 @@
 """How a goal ends, as policy_node says it on topics; and by the action, where it can be built."""
 
 import json
+import signal
 import time
 
 import pytest
@@ -100,6 +101,32 @@ def test_a_blocked_robot_gives_up(robot, tmp_path):
         begun = time.monotonic()
         failed = until(robot, 'failed', 1)
         assert failed['error_code'] == Code.NO_PROGRESS and time.monotonic() - begun < 60
+
+
+def test_a_node_that_ends_says_how_its_goal_ended(robot, tmp_path):
+    with child('vn_nav.nodes.policy_node', tmp_path / 'log',
+               checkpoint=write_checkpoint(tmp_path / 'policy')) as process:
+        robot.show_goal(0)
+        robot.enable()
+        until(robot, 'active', 1)
+        process.send_signal(signal.SIGINT)
+        ended = until(robot, 'failed', 1)
+        assert ended['error_code'] == Code.STOPPED and 'ends' in ended['error_msg']
+        wait_until(lambda: process.poll() is not None, robot.spin)
+        assert process.returncode == 0
+
+
+def test_who_enables_by_itself_obeys_a_person(robot, tmp_path):
+    with child('vn_nav.nodes.policy_node', tmp_path / 'log', auto_enable=True,
+               checkpoint=write_checkpoint(tmp_path / 'policy')):
+        robot.show_goal(0)
+        until(robot, 'active', 1)
+        assert robot.call(SetBool, 'enable', data=False).success
+        until(robot, 'cancelled', 1)
+        robot.spin_for(1.5)
+        assert robot.said[-1]['status'] == 'cancelled' and not robot.moving()
+        robot.show_goal(1)  # that is another thing
+        until(robot, 'active', 2)
 
 
 def _stand(robot):

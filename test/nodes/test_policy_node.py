@@ -183,6 +183,7 @@ def test_a_policy_that_searches_drives_by_a_narrow_wide_format_camera(tmp_path):
     (['-p', 'robot:=/nowhere.yaml'], 'robot file'),
     (['-p', 'mode:=sideways'], 'mode'),
     (['-p', 'stop_threshold:=-0.5'], 'stop_threshold'),
+    (['-p', 'mode:=continuous', '-p', 'blocked_moves:=3'], 'blocked_moves'),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(parameters, word):
     done = subprocess.run([sys.executable, '-m', 'vn_nav.nodes.policy_node', '--ros-args',

@@ -30,6 +30,7 @@ from vn_nav.nodes.qos import qos
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(500)]
 HOUSE, ROOMS = 12_001, 2  # no training saw it
 NODE = 'vn_nav.nodes.route_node'
+SAID = {'stamp': [2, 0], 'status': 'waiting', 'error_code': 0, 'error_msg': '', 'decisions': 0}
 ARRIVED_M, ARRIVED_RAD = 0.9, math.radians(40)  # the recorded picture is of a moving camera
 
 
@@ -230,16 +231,25 @@ def test_what_fails_is_said(way, tmp_path):
     with watching() as watch:
         with child(NODE, tmp_path / 'log', route=folder, place="'3'"):
             assert 'no goal_status' in watch.until('failed')['error_msg']
-            code, _, errors = finish(command('goal', 'bath', '--no-wait'), watch)
-            assert code == 0, errors
-            wait_until(lambda: 'bath' in watch.said[-1]['error_msg'], watch.spin)
+            for said in (1, 2):  # whoever asks again gets an answer again
+                code, _, errors = finish(command('goal', 'bath', '--no-wait'), watch)
+                assert code == 0, errors
+                wait_until(lambda said=said: sum(
+                    'bath' in one['error_msg'] for one in watch.said) == said, watch.spin)
         goal, status = (watch.node.create_publisher(String, name, qos(name))
                         for name in ('route_goal', 'goal_status'))
         watch.said.clear()
         with child(NODE, tmp_path / 'other', route=folder):
             wait_until(lambda: goal.get_subscription_count() and watch.said, watch.spin)
+            # What somebody else writes there is nothing.
+            for name in ('goal_status', 'goal_feedback'):
+                foreign = watch.node.create_publisher(String, name, qos(name))
+                wait_until(foreign.get_subscription_count, watch.spin)
+                for text in ('hello', '[]', '{}', '3'):
+                    foreign.publish(String(data=text))
+                watch.node.destroy_publisher(foreign)
             # A policy without a camera, then one that does not answer.
-            status.publish(String(data=json.dumps({'goal': 4, 'stamp': [1, 0]})))
+            status.publish(String(data=json.dumps({'goal': 4} | SAID | {'stamp': [1, 0]})))
             goal.publish(String(data='2'))
             wait_until(lambda: 'no picture' in watch.said[-1]['error_msg'], watch.spin)
             camera = watch.node.create_publisher(Image, 'image_raw', qos('image_raw'))
@@ -254,12 +264,38 @@ def test_what_fails_is_said(way, tmp_path):
             for number, end in ((6, 'another goal came'), (3, 'began anew')):
                 goal.publish(String(data='2'))
                 wait_until(lambda: watch.said[-1]['status'] == 'active', show)
-                status.publish(String(data=json.dumps({'goal': number, 'stamp': [2, 0]})))
+                status.publish(String(data=json.dumps({'goal': number} | SAID)))
                 wait_until(lambda end=end: end in watch.said[-1]['error_msg'], show)
-            goal.publish(String(data='2'))
-            wait_until(lambda: watch.said[-1]['status'] == 'active', show)
+            # Asked again and again for what it drives to, it shows the picture once.
+            shown = []
+            watch.node.create_subscription(Image, 'goal_image', shown.append, qos('goal_image'))
+            wait_until(lambda: shown, show)  # the last one
+            shown.clear()
+            for asked in range(3):
+                goal.publish(String(data='2'))
+                wait_until(lambda: shown and watch.said and (
+                    watch.said[-1]['status'] == 'active'), show)
+                watch.said.clear()
+                stamp = shown[-1].header.stamp
+                status.publish(String(data=json.dumps({
+                    'goal': 7, 'stamp': [stamp.sec, stamp.nanosec], 'status': 'active',
+                    'error_code': 0, 'error_msg': '', 'decisions': asked})))
+                for _ in range(10):
+                    show()
+            assert len(shown) == 1
             goal.publish(String(data='bath'))
-            wait_until(lambda: 'bath' in watch.said[-1]['error_msg'], show)
+            wait_until(lambda: watch.said and 'bath' in watch.said[-1]['error_msg'], show)
+            # A policy that is gone.
+            goal.publish(String(data='2'))
+            wait_until(lambda: len(shown) == 2, show)
+            stamp = shown[-1].header.stamp
+            status.publish(String(data=json.dumps({
+                'goal': 8, 'stamp': [stamp.sec, stamp.nanosec], 'status': 'active',
+                'error_code': 0, 'error_msg': '', 'decisions': 0})))
+            for _ in range(10):
+                show()
+            watch.node.destroy_publisher(status)
+            wait_until(lambda: 'gone' in watch.said[-1]['error_msg'], show)
 
 
 def test_without_a_route_node_the_command_says_what_to_start():

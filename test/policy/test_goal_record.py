@@ -40,10 +40,23 @@ def test_a_goal_waits_for_enable_and_then_is_under_way():
     rig.navigator.accept_goal(-np.inf)
     assert (rig.navigator.goal.number, rig.navigator.goal.status) == (1, Status.WAITING)
     assert rig.navigator.goal.seconds(rig.now) == 0.0
-    rig.navigator.disable()  # of a goal that is not under way there is no end
-    assert rig.navigator.goal.status is Status.WAITING
     rig = armed()
     assert rig.navigator.goal.status is Status.ACTIVE
+
+
+@pytest.mark.parametrize('take_back', ['disable', 'reset'])
+def test_a_goal_that_a_person_takes_back_waits_no_more(take_back):
+    """Whoever enables what waits (an action, auto_enable) leaves it alone."""
+    rig = Rig()
+    rig.navigator.new_goal()
+    rig.navigator.accept_goal(-np.inf)
+    getattr(rig.navigator, take_back)()
+    assert rig.navigator.goal.status is Status.CANCELLED
+    for _ in range(22):
+        see(rig)
+        rig.step()
+    assert rig.navigator.enable(rig.now)[0]
+    assert (rig.navigator.goal.number, rig.navigator.goal.status) == (1, Status.ACTIVE)
 
 
 def test_a_goal_that_is_cut_anew_is_the_same_goal():
@@ -86,6 +99,18 @@ def test_used_up_decisions_end_it_and_enable_begins_it_again():
     assert rig.navigator.state is State.FAILED and not rig.step().any()
     assert rig.navigator.enable(rig.now)[0] and rig.navigator.state is State.RUNNING
     assert (goal.status, rig.navigator.decisions) == (Status.ACTIVE, 0)
+    rig.decide(FORWARD)
+    assert rig.step().any()
+
+
+def test_a_budget_is_renewed_also_where_motion_was_disabled_in_between():
+    rig = armed(max_decisions=1)
+    rig.decide(FORWARD)
+    finish_action(rig)
+    while rig.navigator.goal.status is Status.ACTIVE:
+        rig.frame_later()
+    rig.navigator.disable()
+    assert rig.navigator.enable(rig.now)[0]
     rig.decide(FORWARD)
     assert rig.step().any()
 

@@ -217,6 +217,37 @@ def test_late_inference_is_discarded_and_the_third_latches(rig):
         assert (rig.navigator.state is State.STOPPED) == (miss == 2)
 
 
+def test_a_slow_policy_does_not_take_its_own_thinking_for_a_silent_camera():
+    """While it thinks no picture is decoded; those that are admitted say that the camera lives."""
+    rig = Rig()
+    rig.navigator.limits = Limits(inference_timeout=1.0)
+    rig.arm()
+
+    def think(sees):
+        ticket = None
+        while ticket is None:
+            ticket = rig.frame_later()
+        for _ in range(8):  # 0.4 s, and the camera is silent after 0.25
+            rig.step()
+            if sees:
+                assert rig.navigator.admit(rig.now, rig.now, rig.now)
+        return rig.navigator.decided(ticket, 0, rig.now)
+    for _ in range(3):
+        assert think(True) and rig.step().any() and rig.navigator.state is State.RUNNING
+        rig.frame()
+        while rig.step().any():
+            rig.frame()
+    assert not think(False) and rig.navigator.reason == 'camera silent'
+    # What came and cannot be decoded is as good as nothing.
+    rig.frame_later()
+    rig.step()
+    rig.navigator.admit(rig.now, rig.now, rig.now)
+    rig.navigator.bad_frame('torn', rig.now)
+    for _ in range(6):
+        rig.step()
+    assert rig.navigator.state is State.HOLD
+
+
 def test_stop_is_immediate_even_in_motion(rig):
     rig.arm()
     rig.decide()

@@ -225,16 +225,18 @@ class _Server:
         self._watchers += 1
         self._robot.watched = True
         shows = asyncio.ensure_future(self._show_live(socket))
+        # A page that is shown nothing any more connects anew.
+        shows.add_done_callback(lambda _: asyncio.ensure_future(socket.close()))
         try:
             async for message in socket:  # the page says nothing; its end is what is waited for
                 if message.type == WSMsgType.ERROR:
                     break
         finally:
+            self._watchers -= 1
+            self._robot.watched = self._watchers > 0
             shows.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError, TimeoutError):
                 await shows
-            self._watchers -= 1
-            self._robot.watched = self._watchers > 0
         return socket
 
     async def _show_live(self, socket: web.WebSocketResponse) -> None:

@@ -173,8 +173,9 @@ class CommandOutput:
                                                 odometry_lost=self.odometry_lost)
                 self._robot_moves = velocity is not None and bool(velocity.any())
                 last = now
-            if velocity is not None:
-                self.send(velocity)
+                # Still holding the lock: no motion goes out after a stop that was answered.
+                if velocity is not None:
+                    self.send(velocity)
 
     def _wait(self, due: float) -> None:
         """Until the next period, or for what does not wait for it.
@@ -222,8 +223,8 @@ class CommandOutput:
                                                 self._stamp, odometry_lost=self.odometry_lost)
                 moved = velocity is not None and bool(velocity.any())
                 moving, first = moved, moved and not moving
-            if velocity is not None:
-                self.send(velocity)
+                if velocity is not None:  # with the lock, as in real time
+                    self.send(velocity)
 
     def _wait_for_odometry(self, answered: int, *, or_decision: bool, timeout: float | None
                            ) -> None:

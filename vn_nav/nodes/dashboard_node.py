@@ -8,7 +8,6 @@ on the page comes from elsewhere. It publishes no command: it asks policy_node, 
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import sys
 import threading
@@ -38,6 +37,7 @@ from vn_nav.nodes import parameters, policy_parameters
 from vn_nav.nodes.goal_publisher import GoalPublisher
 from vn_nav.nodes.process import Ended, run_node
 from vn_nav.nodes.qos import qos, subscribe
+from vn_nav.nodes.said import read_said
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.search.snapshot import snapshot_of
@@ -135,16 +135,22 @@ class DashboardNode(Node):
                 self._status = time.monotonic(), status
 
     def _on_goal_status(self, message: String) -> None:
-        said = json.loads(message.data)
+        said = read_said(self, 'goal_status', message, 'goal', 'status', 'error_msg')
+        if said is None:
+            return
         if said['goal'] != self._goal_status.get('goal'):
             self._feedback, self._track = {}, self._track[-1:]
         self._goal_status = said
 
     def _on_feedback(self, message: String) -> None:
-        self._feedback = json.loads(message.data)
+        said = read_said(self, 'goal_feedback', message, 'decisions', 'arrival',
+                         'distance_remaining')
+        self._feedback = said or self._feedback
 
     def _on_route(self, message: String) -> None:
-        self._route = json.loads(message.data)
+        said = read_said(self, 'route_status', message, 'status', 'error_msg', 'place', 'places',
+                         'shown', 'here')
+        self._route = said or self._route
 
     def _on_picture(self, message: Any) -> None:
         self._picture = (0 if self._picture is None else self._picture[0]) + 1, message

@@ -120,6 +120,11 @@ class DecisionWorker:
             self._goal = message
             self._wake.notify_all()
 
+    def drop_goal(self) -> None:
+        """No picture is the goal any more, also not one that is being prepared."""
+        with self._wake:
+            self._goal = self._goal_in_force = None
+
     def note_executed(self, stamp: float, action: str | None, pose: np.ndarray | None = None, *,
                       says_pose: bool = False, ranges: NamedRanges | None = None,
                       says_ranges: bool = False) -> None:
@@ -183,6 +188,11 @@ class DecisionWorker:
                 self._published = arrived
                 self._arrived.publish(Bool(data=arrived))
 
+    def publish_last(self) -> None:
+        """Publish how the goal has ended, delivered when this returns (200 ms at most)."""
+        self.publish_arrival()
+        self.goal_output.deliver()
+
     def run(self, is_running: Callable[[], bool]) -> None:
         """Decode every admitted frame, until `is_running` says that the node does not any more."""
         while True:
@@ -209,7 +219,7 @@ class DecisionWorker:
         picture, _, view = found
         self._runtime.set_goal(picture, view)
         with self._wake:
-            if self._goal is None:  # else a newer one is waiting
+            if self._is_newest(message):
                 self.goal_output.stamp = sec, nanosec = _stamp(message)
                 again, self._accepted = message is self._accepted, message
                 self._navigator.accept_goal(sec + nanosec * 1e-9 if self._lock_step
@@ -217,10 +227,16 @@ class DecisionWorker:
                 self.publish_arrival(again=True)
 
     def _refuse_goal(self, message: Image, why: str) -> None:
+        if not self._is_newest(message):
+            return
         self.goal_output.stamp = _stamp(message)
         self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
         self._navigator.refuse_goal(why)
         self.goal_output.publish()
+
+    def _is_newest(self, message: Image) -> bool:
+        """Nothing newer is waiting, and nobody has dropped it."""
+        return self._goal is None and self._goal_in_force is message
 
     def _take_frame(self, message, stamp: float, received: float) -> None:
         found = prepared(self.pictures.of, message, self._wake,

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 from geometry_msgs.msg import Pose, PoseStamped
+from rclpy.duration import Duration
 from std_msgs.msg import String
 
 from vn_msgs_py.motion import yaw_to_quaternion
@@ -63,6 +64,10 @@ class GoalOutput:
         if now != self._said:
             self._said = now
             self._status.publish(String(data=json.dumps(self.status())))
+
+    def deliver(self) -> None:
+        """Wait until what was said has been heard, for 200 ms at most."""
+        self._status.wait_for_all_acked(Duration(seconds=0.2))
 
     def decided(self, arrival: float, goal: np.ndarray | None, pose: np.ndarray | None,
                 frame: str, stamp) -> None:

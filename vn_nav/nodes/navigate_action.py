@@ -6,6 +6,7 @@ goal at a time, the newest one counts. Nothing here waits: `tend` looks from tim
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -56,21 +57,24 @@ class NavigateAction:
     Args:
         node: that serves.
         kind: type of the action, see `action_type`.
-        navigator: drives; its lock is held by who calls `tend`.
+        navigator: drives.
+        wake: guards it; held by who calls `tend`.
         show: takes a goal picture, as a message on goal_image; what took it, as one on
             goal_camera_info (None: the robot's camera); decisions and seconds that there are (0:
             as many as by the parameters).
+        refuse: of a picture that is unusable, the reason: as if it had come on goal_image.
         enable: allows motion, as `~/enable` does: whether it did, and why not.
         accepts: whether goals are taken at all.
         output: says what is estimated of the goal.
     """
 
-    def __init__(self, node, kind: Any, navigator: Navigator,
+    def __init__(self, node, kind: Any, navigator: Navigator, wake: threading.Condition,
                  show: Callable[[Image, CameraInfo | None, int, float], None],
-                 enable: Callable[[], tuple[bool, str]], accepts: Callable[[], bool],
-                 output: GoalOutput):
+                 refuse: Callable[[str], None], enable: Callable[[], tuple[bool, str]],
+                 accepts: Callable[[], bool], output: GoalOutput):
         self._node, self._kind, self._navigator, self._output = node, kind, navigator, output
-        self._show, self._enable, self._accepts = show, enable, accepts
+        self._wake, self._show, self._refuse = wake, show, refuse
+        self._enable, self._accepts = enable, accepts
         self._handle: Any = None  # rclpy's, of the goal under way
         self._number = 0  # of the goal of that handle
         self._begun = self._told = 0.0  # steady times [s]
@@ -93,20 +97,24 @@ class NavigateAction:
         return GoalResponse.ACCEPT
 
     def _on_accepted(self, handle) -> None:
-        if self._handle is not None:
-            self._finish(Status.FAILED, Code.STOPPED, 'another goal came')
-        handle.execute()
-        self._handle, request = handle, handle.request
-        self._begun = time.monotonic()
-        self._number, self._asked = self._navigator.goal.number + 1, (False, '')
+        request, refusal = handle.request, ''
         try:
-            message, camera = self._picture(request)
+            message, camera = self._picture(request)  # which takes a while
         except UserError as error:
-            self._finish(Status.FAILED, Code.GOAL_REFUSED, str(error))
-            return
-        allowance = request.time_allowance
-        self._show(message, camera, request.max_decisions,
-                   allowance.sec + allowance.nanosec * 1e-9)
+            refusal = str(error)
+        with self._wake:
+            if self._handle is not None:
+                self._finish(Status.FAILED, Code.STOPPED, 'another goal came')
+            handle.execute()
+            self._handle, self._begun, self._asked = handle, time.monotonic(), (False, '')
+            self._number = self._navigator.goal.number + 1
+            if refusal:  # the goal before is over all the same, as by a picture on goal_image
+                self._refuse(refusal)
+                self._finish(Status.FAILED, Code.GOAL_REFUSED, refusal)
+                return
+            allowance = request.time_allowance
+            self._show(message, camera, request.max_decisions,
+                       allowance.sec + allowance.nanosec * 1e-9)
 
     def _picture(self, request) -> tuple[Image, CameraInfo | None]:
         """The goal picture with a new stamp, and its camera, where a file says what that was.

@@ -89,7 +89,7 @@ class PolicyInputs:
             # node's clock judges.
             clock = None if self._lock_step else self._node.get_clock().now().nanoseconds * 1e-9
             self._frames.add(received, 0.0 if clock is None else clock - stamp)
-            if self._navigator.admit(stamp, clock):
+            if self._navigator.admit(stamp, clock, received):
                 self._worker.show_frame(message, stamp, received)
             else:
                 self._wake.notify_all()
@@ -114,6 +114,14 @@ class PolicyInputs:
                 usual, max_decisions=max_decisions or usual.max_decisions,
                 time_allowance=seconds or usual.time_allowance))
             self._worker.show_goal(message)
+
+    def refuse_goal(self, why: str) -> None:
+        """A goal that did not come on the topic, and cannot be used: the one before is over."""
+        with self._wake:
+            self._navigator.new_goal()
+            self._worker.drop_goal()
+            self._navigator.refuse_goal(why)
+            self._wake.notify_all()
 
     def _on_odometry(self, message: Odometry) -> None:
         self._odometry.add(time.monotonic())

@@ -258,6 +258,7 @@ class PolicyNode(LifecycleNode):
             self._wake.notify_all()
         threads.join('output')  # it waits for nothing but `wake`
         self._output.deliver_zero()  # the output thread is gone: still only one owner
+        self._worker.publish_last()
         ended = threads.join('inference', DECISION_END_TIMEOUT_S)
         if not ended:
             self.get_logger().error(f'a decision did not end within {DECISION_END_TIMEOUT_S:g} s')

@@ -57,7 +57,7 @@ class Operation:
         self._action = None
         if (kind := navigate_action.action_type()) is not None and takes_goals:
             self._action = navigate_action.NavigateAction(
-                node, kind, navigator, inputs.take_goal, self._enable,
+                node, kind, navigator, wake, inputs.take_goal, inputs.refuse_goal, self._enable,
                 lambda: self._node.is_running, worker.goal_output)
         self._timer = node.create_timer(TIMER_PERIOD_S, self._on_timer, clock=steady)
 
@@ -113,7 +113,7 @@ class Operation:
     def _on_stop(self, _request, response):
         with self._wake:
             now = time.monotonic()
-            self._navigator.goal.end(Status.CANCELLED, now, message='~/stop was called')
+            self._navigator.goal.cancel(now, '~/stop was called')
             self._navigator.stop('~/stop was called', now)
             self._worker.publish_arrival()
             self._wake.notify_all()
@@ -136,7 +136,8 @@ class Operation:
                 if others and self._navigator.state in ENABLED:
                     self._navigator.stop(f'{others} other publisher(s) on cmd_vel',
                                          time.monotonic())
-                elif self._auto_enable and self._navigator.state is State.IDLE:
+                elif self._auto_enable and self._navigator.state is State.IDLE and (
+                        self._navigator.goal.status is Status.WAITING):  # nobody took it back
                     self._enable()
                 self._worker.publish_arrival()
                 self._wake.notify_all()

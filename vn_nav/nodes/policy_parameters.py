@@ -97,9 +97,13 @@ def read(node, names: Iterable[str] = tuple(PARAMETERS)) -> dict:
     """Values by name.
 
     Raises:
-        UserError: a value outside its limits, or a threshold that is no probability.
+        UserError: a value outside its limits, a threshold that is no probability, or two that do
+            not go together.
     """
     values = {name: node.get_parameter(name).value for name in names}
     for name, value in values.items():
         check(name, value)
+    if values.get('mode') == 'continuous' and values.get('blocked_moves'):
+        raise UserError('blocked_moves counts the moves of mode stop_and_go, which end',
+                        'mode continuous', 'set progress_decisions in its place')
     return values

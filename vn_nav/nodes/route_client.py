@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from typing import Any
 
@@ -11,6 +10,7 @@ from std_msgs.msg import String
 
 from vn_nav.errors import UserError
 from vn_nav.nodes.qos import qos
+from vn_nav.nodes.said import read_said
 from vn_nav.nodes.visit import visiting
 
 SILENCE_S = 30.0  # without a word of route_node while it drives
@@ -39,7 +39,10 @@ class RouteClient:
                                        qos('route_status', depth=50))
 
     def _hear(self, message: String) -> None:
-        self._heard.append(json.loads(message.data))
+        said = read_said(self._node, 'route_status', message, 'status', 'error_msg', 'place',
+                         'places', 'pictures_shown')
+        if said is not None:
+            self._heard.append(said)
 
     def __enter__(self) -> RouteClient:
         return self

@@ -28,6 +28,7 @@ from vn_nav.nodes.camera_pictures import pictures_of
 from vn_nav.nodes.goal_publisher import GoalPublisher
 from vn_nav.nodes.process import Ended, run_node, spin
 from vn_nav.nodes.qos import qos, subscribe
+from vn_nav.nodes.said import read_said
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.policy.frame_gate import shorten
 from vn_nav.policy.goal_record import Code
@@ -50,6 +51,7 @@ PARAMETERS = {
 # Why a picture was not reached; another one may be. Other failures are of the robot.
 OF_THE_GOAL = Code.BUDGET, Code.NO_PROGRESS, Code.BLOCKED, Code.GOAL_REFUSED
 PATIENCE_S = 10.0  # for a picture, and until motion can be enabled
+GOAL_KEYS = 'goal', 'stamp', 'status', 'error_code', 'error_msg', 'decisions'
 TEND_S = 0.1
 AGAIN_S = 0.5  # until motion is asked for again
 LEAVE_S = 1.0  # for the policy to hear at the end that it stops
@@ -97,16 +99,20 @@ class RouteNode(Node):
         self._follower: RouteFollower | None = None
         self._target = -1
         self._status, self._message, self._said = RouteStatus.NONE, '', ''
+        self._policy_seen = time.monotonic()  # steady time of the newest look that found it [s]
         self._since = 0.0  # steady time of this status, or of the newest picture shown [s]
         self._number: int | None = None  # of policy_node's newest goal; None: it said nothing yet
         self._ours: tuple[int, int] | None = None  # stamp of the picture shown
+        # Picture and stamp that policy_node says it is driving to.
+        self._driven: tuple[int, tuple[int, int]] | None = None
         self._shown: collections.deque[tuple[int, int]] = collections.deque(maxlen=10)  # of late
         self._enables: ServiceCall | None = None
         self._goals = GoalPublisher(self)
         self._enable = self.create_client(SetBool, f'{value["policy"]}/enable')
         self._out = self.create_publisher(String, 'route_status', qos('route_status'))
         self.create_subscription(String, 'route_goal', self._on_place, qos('route_goal'))
-        self.create_subscription(String, 'goal_status', self._on_goal_status, qos('goal_status'))
+        self._hears_goal = self.create_subscription(
+            String, 'goal_status', self._on_goal_status, qos('goal_status'))
         self.create_subscription(String, 'goal_feedback', self._on_feedback, qos('goal_feedback'))
         compressed = value['image_transport'] == 'compressed'
         subscribe(self, CompressedImage if compressed else Image,
@@ -140,8 +146,13 @@ class RouteNode(Node):
             self._cancel('route_goal was empty')
 
     def _on_goal_status(self, message: String) -> None:
-        said = json.loads(message.data)
+        said = read_said(self, 'goal_status', message, *GOAL_KEYS)
+        if said is None:
+            return
         before, self._number = self._number, said['goal']
+        if self._driven is not None and (
+                said['status'] != 'active' or tuple(said['stamp']) != self._driven[1]):
+            self._driven = None
         if self._status is not RouteStatus.ACTIVE:
             return
         stamp = tuple(said['stamp'])
@@ -157,7 +168,8 @@ class RouteNode(Node):
         assert self._follower is not None  # there is a way
         status, why = said['status'], said['error_msg']
         if status == 'active':
-            self._enables = None
+            assert self._ours is not None  # it is of that picture
+            self._enables, self._driven = None, (self._follower.shown, self._ours)
         elif status == 'waiting' and self._enables is None:
             self._end(RouteStatus.CANCELLED, 'motion was disabled')
         elif status == 'succeeded' and self._follower.shown == self._target:
@@ -172,7 +184,9 @@ class RouteNode(Node):
             self._end(RouteStatus.CANCELLED, why)
 
     def _on_feedback(self, message: String) -> None:
-        said = json.loads(message.data)
+        said = read_said(self, 'goal_feedback', message, *GOAL_KEYS, 'distance_remaining')
+        if said is None:
+            return
         if self._status is RouteStatus.ACTIVE and tuple(said['stamp']) == self._ours and (
                 said['status'] == 'active' and self._follower is not None):
             follower = self._follower
@@ -190,6 +204,7 @@ class RouteNode(Node):
 
     def _set_out(self, place: str) -> None:
         """Another way along the route."""
+        self._said = ''  # whoever asks gets an answer
         try:
             target = self._route.index(place)
         except UserError as error:
@@ -212,8 +227,10 @@ class RouteNode(Node):
                 self._status, self._enables = RouteStatus.ACTIVE, self._allow()
                 self._go_on(self._follower.begin)
             elif late:
-                self._end(RouteStatus.FAILED, 'no goal_status of policy_node'
-                          if self._number is None else 'no picture of the camera')
+                self._cancel('no goal_status of policy_node' if self._number is None
+                             else 'no picture of the camera', RouteStatus.FAILED)
+        elif self._status is RouteStatus.ACTIVE and self._is_policy_gone(now):
+            self._cancel('policy_node is gone', RouteStatus.FAILED)
         elif self._status is RouteStatus.ACTIVE and self._enables is not None:
             answered = self._enable.service_is_ready() and self._enables.is_answered()
             if answered and not self._enables.answer.success:
@@ -224,6 +241,12 @@ class RouteNode(Node):
                 self._cancel(f'motion was not enabled: '
                              f'{self._message or "policy_node does not answer"}',
                              RouteStatus.FAILED)
+
+    def _is_policy_gone(self, now: float) -> bool:
+        """Nobody has published goal_status for a while."""
+        if self.count_publishers(self._hears_goal.topic_name):
+            self._policy_seen = now
+        return now - self._policy_seen > PATIENCE_S
 
     def _allow(self) -> ServiceCall:
         return ServiceCall(self._enable, SetBool.Request(data=True), again=AGAIN_S)
@@ -266,6 +289,11 @@ class RouteNode(Node):
     def _show(self, index: int) -> None:
         """Show policy_node a picture of the route."""
         self._since, self._message = time.monotonic(), ''
+        if self._driven is not None and self._driven[0] == index:
+            # It is on its way there, by the way before. Shown again and again it would be taken
+            # for a picture that somebody publishes at a rate.
+            self._ours, self._enables = self._driven[1], None
+            return
         try:
             self._goals.show(*self._route.picture(index))
         except UserError as error:

@@ -92,6 +92,12 @@ class GoalRecord:
         if self.status is Status.ACTIVE:
             self.status, self.code, self.message, self._ended = status, code, message, now
 
+    def cancel(self, now: float, message: str) -> None:
+        """A person takes it back, also where it waits: nobody but a person sets it going."""
+        if self.status is Status.WAITING:
+            self.status, self.message = Status.CANCELLED, message
+        self.end(Status.CANCELLED, now, message=message)
+
     def seconds(self, now: float) -> float:
         """How long it has been under way, or was [s]."""
         if math.isnan(self.begun):

@@ -23,7 +23,7 @@ import numpy as np
 
 from vn_nav.arrival import wrap_angle
 from vn_nav.policy.frame_gate import FrameGate, shorten
-from vn_nav.policy.goal_record import Code, GoalLimits, GoalRecord, Status
+from vn_nav.policy.goal_record import ENDED, Code, GoalLimits, GoalRecord, Status
 from vn_nav.policy.motion import ActionExecutor, cruise, ramp
 from vn_nav.robot import RobotSpec
 
@@ -111,6 +111,8 @@ class Navigator:
         self._rolls_until = -np.inf  # stamp
         self._healthy_since: float | None = None
         self._last_frame: float | None = None  # steady time at which the newest good frame came
+        self._admitted = -np.inf  # steady time at which the newest admitted one came
+        self._thought = -np.inf  # steady time at which the newest decision was made
         self._look_after = -np.inf  # stamp that the next decision's frame must exceed
         self._bad_frames = self._late_inferences = 0
         self._ticket = 0
@@ -124,15 +126,21 @@ class Navigator:
         """Frames that were dropped, by kind."""
         return self.gate.dropped
 
-    def admit(self, stamp: float, clock: float | None) -> bool:
+    def admit(self, stamp: float, clock: float | None, now: float = -math.inf) -> bool:
         """May a frame be used? Judges its stamp against the last one and the clock [s].
 
         A frame that may not is counted in `dropped`, and is as good as none. One that comes from
         a time that was set back is the first of the new time.
+
+        Args:
+            stamp: of the frame; clock: the node's, None: nothing is late [s].
+            now: steady time at which it came [s], see `_heard`.
         """
         if back := self.gate.went_back(stamp, clock):
             self.time_jumped(f'camera stamps went back by {back:.4g} s')
-        return self.gate.admit(stamp, clock)
+        if admitted := self.gate.admit(stamp, clock):
+            self._admitted = max(self._admitted, now)
+        return admitted
 
     def time_jumped(self, reason: str) -> None:
         """A clock was set: forget old stamps, and stand still until enabled again."""
@@ -155,6 +163,7 @@ class Navigator:
     def bad_frame(self, reason: str, now: float) -> None:
         """An admitted frame could not be decoded. Three in a row stop the robot."""
         self.gate.unusable(reason)
+        self._admitted = -np.inf
         self._bad_frames += 1
         self._healthy_since = None
         if self._bad_frames >= 3 and self.state in ENABLED:
@@ -219,8 +228,9 @@ class Navigator:
         if missing:
             return False, '; '.join(missing)
         self._now, self.arrival = now, None
-        if self._failure:
-            self._failure, self.decisions = '', 0  # it has its budget once more
+        self._failure = ''
+        if self.goal.status in ENDED:
+            self.decisions = 0  # it has its budget once more
         if self.state in (State.IDLE, *AT_THE_END):
             self._abandon()
             self.state, self.reason = State.RUNNING, ''
@@ -229,7 +239,7 @@ class Navigator:
 
     def disable(self) -> None:
         """Zero at once, repeated for `STOP_SECONDS`, then silence; not latched."""
-        self.goal.end(Status.CANCELLED, self._now, message='disabled')
+        self.goal.cancel(self._now, 'disabled')
         if self.state is not State.STOPPED:
             self._idle('disabled')
 
@@ -253,7 +263,7 @@ class Navigator:
     def reset(self) -> None:
         """Clear a latched stop; never enables."""
         self._bad_frames = self._late_inferences = 0
-        self.goal.end(Status.CANCELLED, self._now, message='reset')
+        self.goal.cancel(self._now, 'reset')
         self._idle('not enabled')
 
     def _idle(self, reason: str) -> None:
@@ -325,7 +335,7 @@ class Navigator:
         if ticket != self._ticket or self._inferring_since is None:
             return False
         late = now - self._inferring_since > self.limits.inference_timeout
-        self._inferring_since = None
+        self._inferring_since, self._thought = None, now
         if late:
             self._late(now)
             return False
@@ -343,7 +353,7 @@ class Navigator:
 
     def _late(self, now: float) -> None:
         self._ticket += 1
-        self._inferring_since = None
+        self._inferring_since, self._thought = None, now
         self._late_inferences += 1
         self.velocity, self._target = np.zeros(4), np.zeros(4)
         if self._late_inferences >= 3:
@@ -363,11 +373,22 @@ class Navigator:
 
     # Velocities, asked for by the output thread.
 
+    def _heard(self, now: float) -> float:
+        """Steady time at which the camera was last known to see.
+
+        While the policy thinks no picture is decoded, and just after it none has been yet: there
+        those count that were admitted.
+        """
+        known = -np.inf if self._last_frame is None else self._last_frame
+        thinks = self._inferring_since is not None or (
+            now - self._thought <= self.limits.frame_timeout)
+        return max(known, self._admitted) if thinks else known
+
     def deadline(self) -> float:
         """The steady time at which `step` has to be asked again, whatever comes meanwhile."""
         if self.state is not State.RUNNING or self._last_frame is None:
             return np.inf
-        return min(self._last_frame + self.limits.frame_timeout,
+        return min(self._heard(self._now) + self.limits.frame_timeout,
                    np.inf if self._inferring_since is None
                    else self._inferring_since + self.limits.inference_timeout)
 
@@ -409,7 +430,7 @@ class Navigator:
 
     def _watch(self, now: float, odometry_lost: bool) -> None:
         """Silence of camera and odometry, and holds whose cause is gone."""
-        silence = np.inf if self._last_frame is None else now - self._last_frame
+        silence = now - self._heard(now)
         if silence > self.limits.frame_stop_timeout:
             self.stop(f'no camera frame for {self.limits.frame_stop_timeout} s', now,
                       Code.CAMERA_LOST)
