@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+OBJECT_RADIUS = 1.0  # m, geodesic, of goals that are objects (thesis, 5.6)
 ARRIVAL_RADIUS = 0.6  # m: geodesic where a floor map is known, straight where only odometry is
 ARRIVAL_HEADING = math.radians(30.0)  # rad
 
@@ -26,3 +27,8 @@ def heading_error(yaw, goal_yaw):
 def arrived(distance, error):
     """At the goal pose: within the arrival radius and heading."""
     return (distance <= ARRIVAL_RADIUS) & (error <= ARRIVAL_HEADING)
+
+
+def radius_of(task: str) -> float:
+    """How near to its goal a task ends [m]; 0: at the goal itself, such as a room's edge."""
+    return {'image': ARRIVAL_RADIUS, 'object': OBJECT_RADIUS}.get(task, 0.0)

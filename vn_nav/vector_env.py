@@ -115,6 +115,7 @@ class MeasuredVectorEnv(NavigationVectorEnv, Protocol):
     """
 
     config: Any  # `task`, `stop` and `odometry`, as of `EnvConfig`
+    task: Any  # with `ranges`: first view and number of goals, by place
     places: Sequence[Any]  # with `name` and `plan()`
     place_index: Any  # [N] the place of each robot
     goal_poses: Any  # [G,4] x, y [m], yaw, pitch [rad]

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from vn_nav.arrival import radius_of
 from vn_nav.evaluation.metrics import Episode, bootstrap_interval, path_efficiency, summarise
 
 
@@ -26,6 +27,10 @@ def random_episodes(count=40, seed=0):
 def test_path_efficiency_is_shortest_over_driven():
     assert path_efficiency(episode()) == pytest.approx(0.5)
     assert path_efficiency(episode(path_length=3.0)) == 1.0
+    # Objects are reached from a metre away, rooms at their edge.
+    ways = [path_efficiency(episode(start_distance=4.0, path_length=4.0, arrival_radius=radius_of(
+        task))) for task in ('image', 'object', 'room')]
+    assert ways == pytest.approx([0.85, 0.75, 1.0])
     assert path_efficiency(episode(success=False)) == 0.0
     assert path_efficiency(episode(start_distance=0.5, path_length=0.0)) == 1.0
 

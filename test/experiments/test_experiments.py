@@ -229,15 +229,45 @@ def test_a_command_that_fails_is_said_in_one_line(tmp_path, capsys):
 
 
 def test_a_value_is_reached_where_it_holds():
-    frames = np.arange(1, 101) * 100.0
-    length = np.where(frames < 5000, 300.0, 50.0)
+    frames = np.arange(1, 101) * 10_000.0
+    length = np.where(frames < 500_000, 300.0, 50.0)
     length[9] = 40.0  # once, by luck
-    run = Run(Path('run'), 'run', {'frames': frames, 'minutes': frames / 100,
-                                   'tau': np.where(frames < 6000, 0.5, 1.0), 'length': length})
-    assert reached(run, 100, 'length', falls=True, in_curriculum=True) == (5000.0, 50.0)
-    assert reached(run, 100, 'length', falls=True) == (6000.0, 60.0)
+    columns = {'frames': frames, 'minutes': frames / 10_000,
+               'tau': np.where(frames < 600_000, 0.5, 1.0), 'length': length}
+    run = Run(Path('run'), 'run', columns)
+    assert reached(run, 100, 'length', falls=True, in_curriculum=True) == (500_000.0, 50.0)
+    # From tau 1 on 200 episodes of 50 frames each have to end before a mean is of them alone.
+    assert reached(run, 100, 'length', falls=True) == (610_000.0, 61.0)
     assert reached(run, 45, 'length', falls=True) is None
     assert reached(run, 200, 'length') is None  # no row at tau 1 is so high
+    # What is good at the end alone has not held yet.
+    late = Run(Path('late'), 'late', columns | {'length': np.where(frames < 920_000, 300.0, 50.0)})
+    assert reached(late, 100, 'length', falls=True) is None
+
+
+def test_what_was_run_with_other_options_is_not_taken_for_a_run(tmp_path):
+    path = small(tmp_path)
+    own = reproduction(path, tmp_path)
+    arm = next(iter(own.experiment.arms))
+    kept = own.kept / own.run_name(arm, 0)
+    kept.mkdir(parents=True)
+    (kept / 'evaluation.json').write_text(json.dumps({'options': own.options(arm) | {'size': 7}}))
+    with pytest.raises(UserError, match='size: 7'):
+        own.run([0], print)
+    (kept / 'evaluation.json').unlink()
+    begun = own.out / own.folder / own.run_name(arm, 0)
+    begun.mkdir(parents=True)
+    (begun / 'options.json').write_text(json.dumps(own.options(arm) | {'frames': 3}))
+    with pytest.raises(UserError, match='frames: 3'):
+        own.run([0], print)
+
+
+def test_runs_that_stay_in_the_curriculum_are_measured_there(tmp_path):
+    fig = Reproduction(load_experiment('fig5.7'), 'quick', tmp_path, tmp_path)
+    words = fig.evaluate_command('UNREAL', 1)
+    assert words[words.index('--difficulty') + 1] == '0.3'
+    whole = Reproduction(load_experiment('fig5.7'), 'full', tmp_path, tmp_path)
+    assert '--difficulty' not in whole.evaluate_command('UNREAL', 1)
 
 
 def test_a_thinned_curve_keeps_its_last_row(tmp_path):

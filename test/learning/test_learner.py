@@ -242,6 +242,16 @@ def test_schedules_are_linear():
             assert torch.allclose(part, expected[0][name], rtol=1e-4, atol=1e-6), name
 
 
+def test_the_rate_rises_in_the_first_updates():
+    config = LearnerConfig(learning_rate=1e-3, final_learning_rate=0.0, epochs=1, minibatches=1,
+                           warmup_updates=4)
+    network = Policy(SMALL)
+    learner, _ = learner_of(network, config)
+    for updates, progress, rate in ((0, 0.0, 2.5e-4), (2, 0.5, 3.75e-4), (9, 0.5, 5e-4)):
+        learner.update(collected(network), progress, updates)
+        assert learner.optimiser.param_groups[0]['lr'] == pytest.approx(rate)
+
+
 @pytest.mark.parametrize('size', [36, 128])
 def test_the_total_gradient_is_the_weighted_sum(size):
     """Of the thesis's nine losses, each on a draw of its own (thesis, 5.3 and table 5.1)."""
@@ -391,7 +401,7 @@ def test_what_a_learner_needs_is_asked_for():
     {'learning_rate': 0.0}, {'final_learning_rate': -1.0}, {'clip': 0.0}, {'gamma': 1.1},
     {'lam': -0.1}, {'depth': -1.0}, {'optimiser': 'sgd'}, {'epochs': 0}, {'minibatches': 0},
     {'max_gradient_norm': 0.0}, {'replay_batch': 0}, {'unrewarded': 2.0},
-    {'learning_rate': math.nan}, {'goal_pose': math.nan}])
+    {'learning_rate': math.nan}, {'goal_pose': math.nan}, {'warmup_updates': -1}])
 def test_bad_numbers_are_refused(field):
     with pytest.raises(UserError, match=next(iter(field))):
         LearnerConfig(**field)

@@ -72,6 +72,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         f'{SIDE} pixels, which its network is shown shrunk (default: none)')
     parser.add_argument('--stop', choices=evaluator.STOPS, help='what ends the episodes: '
                         'arriving, or that the policy says so (default: both, apart)')
+    parser.add_argument('--difficulty', type=float, default=1.0, metavar='TAU', help='of the '
+                        'starts, as in a curriculum: share of the largest distance from which '
+                        'they are drawn (default 1: anywhere)')
     parser.add_argument('--no-controls', action='store_true')
     parser.add_argument('--per-scene', action='store_true', help='print each scene as well')
     parser.add_argument('--json', type=Path, metavar='FILE', help='also write the figures here')
@@ -87,7 +90,8 @@ def run(args: argparse.Namespace) -> int:
         episodes=args.episodes, seed=args.seed, decoding=args.decoding,
         controls=() if args.no_controls else evaluator.CONTROLS,
         stop_threshold=args.stop_threshold, robot=load_robot(args.robot) if args.robot else None,
-        stops=(args.stop,) if args.stop else evaluator.STOPS, verify=args.verify)
+        stops=(args.stop,) if args.stop else evaluator.STOPS, verify=args.verify,
+        difficulty=args.difficulty)
     # Pictures of a drive were taken with its own camera.
     checkpoint, robot = load_for(args.checkpoint, args.robot, any_camera=args.bag is None)
     odometry = odometry_for(checkpoint.network, args.odometry)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from vn_nav.arrival import radius_of
 from vn_nav.errors import UserError
 from vn_nav.evaluation.metrics import Episode, summarise
 from vn_nav.lens import zoom_of
@@ -87,7 +88,7 @@ def run_episodes(env: MeasuredVectorEnv, actor: Actor, episodes: int, *, seed: i
             found[n].append(Episode(
                 success=bool(info['success'][n]), start_distance=float(info['start_distance'][n]),
                 path_length=float(info['path_length'][n]), decisions=int(info['decisions'][n]),
-                unit=env.distance_unit,
+                unit=env.distance_unit, arrival_radius=radius_of(env.config.task),
                 collisions=int(collisions[n]), seconds=float(seconds[n]),
                 stop_distance=float(info['distance'][n]),
                 stop_heading=float(info['heading_error'][n]), reward=float(reward[n]),

@@ -36,12 +36,15 @@ class EvaluateConfig:
     stops: tuple[str, ...] = evaluator.STOPS  # what ends the episodes
     policy: bool = True  # the policy itself drives to its goals; else the controls alone
     verify: str = NONE  # see `vn_nav.policy.search.verification`
+    difficulty: float = 1.0  # tau of the starts; 1: anywhere
 
     def __post_init__(self):
         threshold = self.stop_threshold
         rules = (
             (self.episodes >= 1, 'there is at least one episode', self.episodes,
              'raise --episodes'),
+            (0 < self.difficulty <= 1, 'difficulty lies in (0, 1]', self.difficulty,
+             'choose a value in range'),
             (threshold is None or 0 <= threshold < 1, 'the stop threshold lies in [0, 1)',
              threshold, 'choose a value in range'),
             (self.decoding in (None, *DECODINGS), f'decoding is one of {", ".join(DECODINGS)}',
@@ -147,6 +150,8 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
 
     def make(names: Sequence[str], environments: int, stop: str):
         env = make_env(names, environments, stop)
+        if config.difficulty < 1.0:
+            env.set_difficulty(config.difficulty)
         can = env.simulator.capabilities
         if can.rewards:  # its task is its own: no goal to show another of, and no way to it
             controls[:] = [name for name in controls
@@ -154,7 +159,7 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
         if not (can.geodesic or env.simulator.planner) and evaluator.SHORTEST in controls:
             controls.remove(evaluator.SHORTEST)
         # One goal has no other to take for it; where there is none, none is shown.
-        if min(len(place.goals) for place in env.places) < 2 and evaluator.WRONG in controls:
+        if min(count for _, count in env.task.ranges) < 2 and evaluator.WRONG in controls:
             controls.remove(evaluator.WRONG)
         if env.config.task != 'image' and evaluator.ABSENT in controls:
             controls.remove(evaluator.ABSENT)

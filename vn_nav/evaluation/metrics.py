@@ -38,6 +38,7 @@ class Episode:
     seconds: float  # at the robot's default limits
     stop_distance: float  # m, geodesic, at the end
     stop_heading: float  # rad, unsigned, at the end
+    arrival_radius: float = ARRIVAL_RADIUS  # m, see `vn_nav.arrival.radius_of`
     unit: str = 'm'  # of distances and path: 'm'; 'steps' (decisions) on a grid; '': none
     reward: float = 0.0  # undiscounted return
     goal: str = ''
@@ -60,12 +61,13 @@ class Episode:
 def path_efficiency(episode: Episode) -> float:
     """S * l / max(p, l): the episode's share in SPL (Anderson et al. 2018).
 
-    l is the geodesic start distance less the arrival radius, p the metres really moved; on a grid
-    both are steps, and the goal has no radius. NaN where nobody knows the shortest way.
+    l is the geodesic start distance less the radius of the task's goals, p the metres really
+    moved; on a grid both are steps, and the goal has no radius. NaN where nobody knows the
+    shortest way.
     """
     if math.isnan(episode.start_distance):
         return math.nan  # nobody knows the shortest way
-    radius = ARRIVAL_RADIUS if episode.unit == 'm' else 0.0
+    radius = episode.arrival_radius if episode.unit == 'm' else 0.0
     shortest = max(episode.start_distance - radius, 0.0)
     longest = max(episode.path_length, shortest)
     return float(episode.success) * (shortest / longest if longest > 0 else 1.0)

@@ -24,6 +24,7 @@ from vn_nav.report.curves import METRICS, thin
 from vn_nav.resources import share_file
 
 EVALUATION = 'evaluation.json'
+OPTIONS = 'options.json'  # in a run's folder: what it was begun with
 SCENES = '{scenes}'  # in a command of `prepare`: --scene of all of them
 
 
@@ -74,6 +75,40 @@ class Reproduction:
         """Folder of what stays."""
         return self.results / self.folder
 
+    def options(self, arm: str) -> dict[str, object]:
+        """Of `vn_nav train` for an arm, as JSON has them, with names in place of folders."""
+        options = self.experiment.options(arm, self.size)
+        if self.scenes:
+            options['scene'] = list(self.scenes)
+        if self.frames:
+            options['frames'] = self.frames
+        return json.loads(json.dumps(options))
+
+    def _check(self, arm: str, options: object, folder: Path) -> None:
+        """Whether what is there was run with the options of now.
+
+        Raises:
+            UserError: it was not; None: nobody knows.
+        """
+        wanted = self.options(arm)
+        if options is None or options == wanted:
+            return
+        assert isinstance(options, dict)
+        others = [f'{key}: {options.get(key)}, now {wanted.get(key)}'
+                  for key in {**options, **wanted} if options.get(key) != wanted.get(key)]
+        raise UserError('runs of an experiment have the same options',
+                        f'{folder}: {"; ".join(others)}', 'remove it, or choose another folder')
+
+    def _difficulty(self, arm: str) -> float:
+        """Tau at the end of the trainings of an arm, from which it is measured."""
+        from vn_nav.learning.presets import TrainConfig
+        sets = self.options(arm).get('set', {})
+        assert isinstance(sets, dict)
+        begin, end = (float(sets.get(f'curriculum_{name}', 0.0)) for name in ('begin', 'end'))
+        if begin < 1.0 or end <= begin:
+            return 1.0
+        return float(sets.get('start_difficulty', TrainConfig.start_difficulty))
+
     def run_name(self, arm: str, seed: int) -> str:
         """Of a run's folder."""
         return f'{slug(arm)}-seed{seed}'
@@ -85,8 +120,13 @@ class Reproduction:
             UserError: a command failed.
         """
         runs = [(arm, seed) for seed in self.seeds for arm in self.arms or self.experiment.arms]
-        left = [(arm, seed) for arm, seed in runs
-                if not (self.kept / self.run_name(arm, seed) / EVALUATION).exists()]
+        left = []
+        for arm, seed in runs:
+            kept = self.kept / self.run_name(arm, seed) / EVALUATION
+            if kept.exists():
+                self._check(arm, json.loads(kept.read_text()).get('options'), kept.parent)
+            else:
+                left.append((arm, seed))
         if not left:
             return
         self._prepare(cores, say)
@@ -124,11 +164,7 @@ class Reproduction:
 
     def train_command(self, arm: str, seed: int, resume: bool = False) -> list[str]:
         """`vn_nav train` of one run, from its beginning or with the run that is there."""
-        options = self.experiment.options(arm, self.size)
-        if self.scenes:
-            options['scene'] = list(self.scenes)
-        if self.frames:
-            options['frames'] = self.frames
+        options = self.options(arm)
         if self.device != 'cpu':
             options['device'] = self.device
         if resume:
@@ -143,6 +179,8 @@ class Reproduction:
         first = arm == next(iter(self.experiment.arms)) and seed == self.seeds[0]
         options = {key: value for key, value in self.experiment.options(arm, self.size).items()
                    if key in ('robot', 'max_decisions')} | dict(self.experiment.evaluate)
+        if (difficulty := self._difficulty(arm)) < 1.0:
+            options['difficulty'] = difficulty
         return ['evaluate', str(folder / 'checkpoint'), '--stop', 'arrival',
                 *arguments(options, self.values), *([] if first else ['--no-controls']),
                 '--json', str(folder / EVALUATION)]
@@ -151,11 +189,18 @@ class Reproduction:
         """Training and measurement of one run."""
         name = self.run_name(arm, seed)
         folder = self.out / self.folder / name
+        begun = folder / OPTIONS
+        if begun.exists():
+            self._check(arm, json.loads(begun.read_text()), folder)
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_file(begun, (json.dumps(self.options(arm), indent=1) + '\n').encode())
 
         def keep() -> None:
             thin(folder, self.kept / name)
             found = json.loads((folder / EVALUATION).read_text())
             found |= {'arm': arm, 'seed': seed, 'machine': self.machine,
+                      'options': self.options(arm), 'difficulty': self._difficulty(arm),
                       'date': datetime.date.today().isoformat(),
                       'command': ['vn_nav', *self.train_command(arm, seed)]}
             text = json.dumps(found, indent=1).replace(f'{Path.cwd()}{os.sep}', '')

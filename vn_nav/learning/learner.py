@@ -77,12 +77,13 @@ class Learner:
             self.optimiser = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99,
                                                  eps=config.rmsprop_epsilon)
 
-    def update(self, rollout: Rollout, progress: float = 0.0) -> Losses:
+    def update(self, rollout: Rollout, progress: float = 0.0, updates: int = 0) -> Losses:
         """Several epochs over one rollout, each step with every auxiliary task.
 
         Args:
             rollout: what the present network collected.
             progress: share of the training that is over, in [0, 1], for the linear schedules.
+            updates: there were before this one.
 
         Returns:
             `BASIC_LOSSES` and the unweighted loss of each task, means over the steps.
@@ -93,6 +94,8 @@ class Learner:
         """
         config = self.config
         rate = _linear(config.learning_rate, config.final_learning_rate, progress)
+        if config.warmup_updates:
+            rate *= min(1.0, (updates + 1) / config.warmup_updates)
         for group in self.optimiser.param_groups:
             group['lr'] = rate
         entropy_coefficient = _linear(config.entropy_coefficient,

@@ -28,6 +28,9 @@ class LearnerConfig:
     rmsprop_epsilon: float = 1e-5
     learning_rate: float = 4e-4  # at the start
     final_learning_rate: float = 4e-5
+    # Updates in which the rate rises to its value. RMSprop begins with squares of 0, so its first
+    # step moves every weight by ten times the rate: too much for weights that know something.
+    warmup_updates: int = 0
     gamma: float = 0.99  # discount
     lam: float = 0.95  # of the advantage estimator
     clip: float | None = 0.2  # None: no clipping
@@ -77,6 +80,8 @@ class LearnerConfig:
             value = getattr(self, name)
             if not value > 0 and not (name == 'final_learning_rate' and value == 0):
                 raise UserError(f'{name} is positive', value, 'correct it')
+        if not self.warmup_updates >= 0:
+            raise UserError('warmup_updates is not negative', self.warmup_updates, 'correct it')
         if self.clip is not None and not self.clip > 0:
             raise UserError('clip is positive, or None', self.clip, 'correct it')
         for name in ('gamma', 'lam', 'pixel_control_gamma', 'unrewarded', 'imitation_until',

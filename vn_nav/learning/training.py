@@ -35,6 +35,7 @@ from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.resnet import load_frozen_weights
 from vn_nav.policy.zhu import GivenFeatures
 from vn_nav.policy.zhu_policy import ScenePolicy, build_policy
+from vn_nav.report.curves import RECENT_EPISODES
 from vn_nav.vector_env import GoalLabelsEnv, LabelledEnv, NavigationVectorEnv
 
 CHECKPOINT, STATE, REPLAY = 'checkpoint', 'training_state', 'replay'
@@ -44,7 +45,6 @@ RANK_SEED_STEP = 10_007  # between the seeds of processes
 RESUMPTION_SEED_STEP = 1_000_003  # between the seeds of a run and its resumptions
 COLUMNS = ('frames', 'minutes', 'fps', 'tau', 'success', 'return', 'length', 'collisions',
            *BASIC_LOSSES, 'collect_seconds', 'update_seconds', *TASKS)
-RECENT_EPISODES = 200  # that the shown success, return, length and collisions are means over
 
 
 class Training:
@@ -235,7 +235,7 @@ class Training:
                 pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(1))
                 collecting = pool.submit(self.collect)
             with written(self.folder / REPLAY):
-                losses = self.learner.update(rollout, self.progress)
+                losses = self.learner.update(rollout, self.progress, self.updates)
             if collecting is not None:
                 self.ahead = collecting.result()
         if self.actor is not self.network:

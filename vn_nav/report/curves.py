@@ -18,6 +18,7 @@ METRICS = 'metrics.csv'
 NEEDED = ('frames', 'minutes', 'tau', 'success')
 THRESHOLDS = (0.5, 0.9)  # of success
 FULL_TAU = 0.999  # a tau from here on is 1: starts as far from the goal as in the evaluation
+RECENT_EPISODES = 200  # that success, return, length and collisions of a row are means over
 HOLD_SHARE = 0.1  # of a run: how long a success has to hold on average
 CURVE_POINTS = 240  # of a curve
 KEPT_ROWS = 400  # of a curve that stays
@@ -31,7 +32,8 @@ class Run:
 
     path: Path
     label: str  # runs of equal labels are seeds of one curve
-    columns: dict[str, np.ndarray]  # `NEEDED` and the metric, one value an update
+    # `NEEDED`, the metric and, if it is known, length; one value an update.
+    columns: dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +83,7 @@ def _columns(file: Path, metric: str) -> dict[str, np.ndarray]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f'a run is a folder with {METRICS}, or such a file', f'{file}: {error}',
                         'name the folder that vn_nav train --out wrote') from error
-    names = dict.fromkeys((*NEEDED, metric))
+    names = dict.fromkeys((*NEEDED, metric, *(['length'] if rows and 'length' in rows[0] else [])))
     for name in names:
         if rows and name not in rows[0]:
             raise UserError(f'{METRICS} has the columns {", ".join(names)}',
@@ -155,9 +157,10 @@ def reached(run: Run, threshold: float, metric: str = 'success', *, falls: bool 
             in_curriculum: bool = False) -> tuple[float, float] | None:
     """Frames and minutes to a value of a metric; None: not in this run.
 
-    A success inside the curriculum is none: its starts are nearer. Nor is one that does not hold:
-    the episodes that end first, at the beginning of a training, are the successful ones. So a row
-    counts when the mean over the following tenth of the run is as good.
+    A success inside the curriculum is none: its starts are nearer. Nor is one that does not hold.
+    So a row counts when all of the episodes that it is a mean of have begun since the run, or its
+    last stage, began (those that end first are the successful ones), and when the mean over the
+    following tenth of the run, which has to be there, is as good.
 
     Args:
         run: as read.
@@ -169,8 +172,15 @@ def reached(run: Run, threshold: float, metric: str = 'success', *, falls: bool 
     frames, sign = run.columns['frames'], -1 if falls else 1
     values = sign * run.columns[metric]
     good = values >= sign * threshold
+    begun = frames[0]
     if not in_curriculum:
-        good &= run.columns['tau'] >= FULL_TAU
+        full = run.columns['tau'] >= FULL_TAU
+        begun = frames[np.argmax(full)] if full.any() else np.inf
+    good &= frames >= begun
+    if 'length' in run.columns:
+        good &= frames - begun >= RECENT_EPISODES * np.nan_to_num(
+            run.columns['length'], nan=np.inf)
+    good &= frames <= (1 - HOLD_SHARE) * frames[-1]
     for k in np.nonzero(good)[0]:
         following = (frames >= frames[k]) & (frames <= frames[k] + HOLD_SHARE * frames[-1])
         if np.nanmean(values[following]) >= sign * threshold:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from vn_nav import __version__
-from vn_nav.evaluation.evaluator import ARRIVAL, RANDOM, SHORTEST
+from vn_nav.evaluation.evaluator import ARRIVAL, BLANK, RANDOM, SHORTEST, WRONG
 from vn_nav.experiments.experiment import Experiment
 from vn_nav.experiments.reproduction import EVALUATION
 from vn_nav.files import write_file
@@ -24,7 +24,8 @@ from vn_nav.report.curves import HOLD_SHARE, Run, grouped, reached, read_runs
 from vn_nav.report.page import page, table
 from vn_nav.report.terminal import print_table
 
-CONTROLS = (RANDOM, SHORTEST)
+CONTROLS = (RANDOM, SHORTEST)  # in the chart
+IN_TABLE = (*CONTROLS, WRONG, BLANK)
 # Figures of the measurements in the table: heading, key, format.
 FIGURES = (('success', 'success', '.2f'), ('SPL', 'spl', '.2f'), ('decisions', 'decisions', '.0f'),
            ('return', 'return', '.2f'), ('collisions', 'collisions', '.1%'))
@@ -51,7 +52,8 @@ def write_results(experiment: Experiment, size: str, folder: Path) -> dict[str, 
     groups = {arm: own for arm in experiment.arms if (own := grouped(runs).get(arm))}
     controls = _controls(found)
     key = MEASURED.get(experiment.metric, experiment.metric)
-    levels = {name: own[key] for name, own in controls.items() if own.get(key) is not None}
+    levels = {name: controls[name][key] for name in CONTROLS
+              if controls.get(name, {}).get(key) is not None}
     result: dict[str, Any] = {
         'experiment': experiment.name, 'size': size,
         'machines': sorted({own['machine'] for own in found}),
@@ -75,7 +77,7 @@ Lines are means over seeds, bands go from the least to the greatest, and both en
 shortest of these runs ends. Dashed: inside the curriculum. Horizontal: measured controls.</p>
 {table(headings, [[html.escape(cell) for cell in line] for line in lines])}
 <p class="soft">Frames to a value: where the mean over the following tenth of the run holds it.
-The other columns are measured after the training, starts anywhere, actions sampled; means over
+The other columns are measured after the training, {_starts(found)}, actions sampled; means over
 seeds, in brackets the least and the greatest.</p>
 <p class="soft">{html.escape(', '.join(result['machines']))}; {html.escape(' to '.join(
         dict.fromkeys((result['dates'][0], result['dates'][-1]))))}; vn_nav {__version__}</p>
@@ -87,6 +89,13 @@ seeds, in brackets the least and the greatest.</p>
         write_file(folder / name, data)
     print_table(f'{experiment.name}, {size}', headings, lines)
     return result
+
+
+def _starts(found: Sequence[dict]) -> str:
+    """Where the measured episodes start, in words."""
+    taus = sorted({own.get('difficulty', 1.0) for own in found})
+    return 'starts anywhere' if taus == [1.0] else (
+        f'starts as near as in the training ({", ".join(f"tau {tau:g}" for tau in taus)})')
 
 
 def _measurements(experiment: Experiment, folder: Path) -> list[dict]:
@@ -107,7 +116,7 @@ def _rows(measurement: dict) -> dict[str, dict]:
 def _controls(found: Sequence[dict]) -> dict[str, dict]:
     """The rows of the controls: of the first measurement that has them."""
     rows = next((own for own in map(_rows, found) if RANDOM in own), {})
-    return {name: rows[name] for name in CONTROLS if name in rows}
+    return {name: rows[name] for name in IN_TABLE if name in rows}
 
 
 def _figures(experiment: Experiment, runs: Sequence[Run], measured: Sequence[dict]
@@ -133,20 +142,23 @@ def _figures(experiment: Experiment, runs: Sequence[Run], measured: Sequence[dic
 def _cells(experiment: Experiment, result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Headings and lines of the table, plain text."""
     sign = 'at most' if experiment.falls else 'at least'
+    # Where a simulator pays by its own rules there is no goal to get to.
+    figures = [one for one in FIGURES
+               if experiment.metric != 'return' or one[1] not in ('success', 'spl')]
     headings = ['', 'seeds', 'frames [k]', 'minutes',
                 *(f'frames [k] to {experiment.metric} {sign} {value:g}'
                   for value in experiment.reach),
-                f'{experiment.metric} at the end', *(heading for heading, *_ in FIGURES)]
+                f'{experiment.metric} at the end', *(heading for heading, *_ in figures)]
     lines = []
     for arm, own in result['arms'].items():
         line = [arm, str(len(own['seeds'])), spread([v / 1e3 for v in own['frames']], ',.0f'),
                 spread(own['minutes'], '.0f')]
         line += [_when(points, own['frames']) for points in own['reached'].values()]
         line.append(spread(own[f'{experiment.metric}_at_the_end'], '.3g'))
-        lines.append(line + [spread(own[key], form) for _, key, form in FIGURES])
+        lines.append(line + [spread(own[key], form) for _, key, form in figures])
     for name, own in result['controls'].items():
         lines.append([name, *[''] * (4 + len(experiment.reach)),
-                      *(spread([own[key]], form) for _, key, form in FIGURES)])
+                      *(spread([own[key]], form) for _, key, form in figures)])
     return headings, lines
 
 

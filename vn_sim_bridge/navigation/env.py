@@ -427,7 +427,8 @@ class NavigationEnv(gymnasium.vector.VectorEnv):
             self._odometry.begin(env_ids)
         self._measure(env_ids)
         # Where nobody knows the ways no figure is made of the shortest one.
-        known = self.simulator.capabilities.geodesic
+        can = self.simulator.capabilities
+        known = can.geodesic and not can.rewards  # who pays itself has goals of its own
         self._start_distance[env_ids] = self._distance[env_ids] if known else np.nan
         if self._exploration is not None:
             self._exploration.begin(env_ids)

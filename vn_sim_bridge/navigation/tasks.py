@@ -21,6 +21,7 @@ import numpy as np
 from vn_nav.arrival import (  # noqa: F401
     ARRIVAL_HEADING,
     ARRIVAL_RADIUS,
+    OBJECT_RADIUS,
     arrived,
     heading_error,
     wrap_angle,
@@ -39,7 +40,6 @@ from vn_sim_bridge.navigation.episodes import (
 )
 from vn_sim_bridge.simulator import Distance, Goal, Place, Placed, StraightDistance
 
-OBJECT_RADIUS = 1.0  # m, geodesic (thesis, 5.6)
 COLLECT_RADIUS = 0.45  # m, straight: the robot's rim touches the fruit
 VISIBLE_SHARE = 0.045  # of the picture that shows the room's objects (House3D)
 VISIBLE_STEPS = 2  # decisions in a row

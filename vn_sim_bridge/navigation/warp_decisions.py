@@ -132,7 +132,9 @@ def decide(houses: Houses, robots: Robots, rules: Rules, deltas: wp.array2d(dtyp
     locate_goal(houses, robots, n)
     success = robots.arrived[n]
     sparse = wp.float32(0.0)
-    shaping = rules.progress * (before - after)
+    shaping = _f64(0.0)
+    if wp.isfinite(before) and wp.isfinite(after):
+        shaping = rules.progress * (before - after)
     if robots.collided[n]:
         shaping = shaping + rules.collision
     if success:
