@@ -160,8 +160,9 @@ def test_an_experiment_runs_from_files_to_page_and_is_not_repeated(tmp_path, cap
     result = json.loads((kept / 'figures.json').read_text())
     assert list(result['arms']) == ['LSTM', 'Frame stack']
     own = result['arms']['LSTM']
-    assert own['seeds'] == [0, 1] and all(own['reached']['1000'])
-    assert own['reached']['1'] == [None, None]
+    # In so few frames no mean is of 200 episodes: nothing is said to be reached.
+    assert own['seeds'] == [0, 1]
+    assert own['reached'] == {'1000': [None, None], '1': [None, None]}
     assert set(result['controls']) == {'random actions', 'shortest path'}
     assert result['controls']['shortest path']['decisions'] <= 12
     page, table = (kept / 'page.html').read_text(), (kept / 'table.md').read_text()

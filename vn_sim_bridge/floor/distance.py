@@ -11,6 +11,7 @@ import numpy as np
 from vn_sim_bridge.floor.floor_map import CELL, FloorMap, Rect
 
 FAR = 1e9  # cells: not reached
+NEAR = 32  # see `interpolate`: close to furniture, and not behind a wall
 
 
 class FloorDistance:
@@ -47,14 +48,10 @@ class FloorDistance:
         return float(self.values[np.isfinite(self.values)].max())
 
     def at(self, xy: np.ndarray) -> np.ndarray:
-        """Distance of positions [N,>=2] to the point [m].
-
-        Cells miss a gap that is hardly wider than the robot: behind it, as close to furniture, the
-        way to the nearest cell that is reached is taken to be straight.
-        """
+        """Distance of positions [N,>=2] to the point [m]; inf where it cannot be reached."""
         return interpolate(self.values[None], np.zeros(len(xy), np.int64),
                            (xy[:, 0] - self.floor.origin[0]) / CELL - 0.5,
-                           (xy[:, 1] - self.floor.origin[1]) / CELL - 0.5)
+                           (xy[:, 1] - self.floor.origin[1]) / CELL - 0.5, NEAR)
 
 
 @numba.njit(cache=True)
@@ -112,11 +109,11 @@ def _fast_sweeping(free, t):
 
 
 @numba.njit(cache=True)
-def interpolate(stack, which, columns, rows):
+def interpolate(stack, which, columns, rows, near):
     """Distances [K] at fractional cells, from maps `which` [K] of a stack [G,rows,columns].
 
-    Bilinear where all four neighbours are reached, else over one near by that is; inf where no
-    cell of the map is.
+    Bilinear where all four neighbours are reached, else straight to one that is and on from there;
+    inf where none is within about half of `near` cells.
     """
     height, width = stack.shape[1:]
     out = np.empty(len(columns))
@@ -134,7 +131,7 @@ def interpolate(stack, which, columns, rows):
         # Off those cells: over the nearest of them, searched outwards.
         best = np.inf
         ring = 2
-        while best == np.inf and ring < 2 * (height + width):
+        while best == np.inf and ring < near:
             for p in range(max(0, i - ring), min(height, i + ring + 2)):
                 for q in range(max(0, j - ring), min(width, j + ring + 2)):
                     if values[p, q] < np.inf:

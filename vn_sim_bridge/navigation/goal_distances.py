@@ -39,9 +39,14 @@ class FloorDistances:
             self.maps[env, :rows, :columns] = values
 
     def at(self, env_ids: np.ndarray, places: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Of robots [K] in places [K] at poses [K,>=2] to their goals, [K] m."""
+        """Of robots [K] in places [K] at poses [K,>=2] to their goals, [K] m.
+
+        Cells miss a gap that is hardly wider than a robot. It may have got through one, so it can
+        get back: the way to the nearest cell that is reached is taken to be straight, however far.
+        """
         cells = (poses[:, :2] - self.origins[places]) / CELL - 0.5
-        return interpolate(self.maps, np.asarray(env_ids), cells[:, 0], cells[:, 1])
+        return interpolate(self.maps, np.asarray(env_ids), cells[:, 0], cells[:, 1],
+                           2 * sum(self.maps.shape[1:]))
 
 
 class SeparateDistances:
