@@ -163,7 +163,7 @@ def test_an_experiment_runs_from_files_to_page_and_is_not_repeated(tmp_path, cap
     # In so few frames no mean is of 200 episodes: nothing is said to be reached.
     assert own['seeds'] == [0, 1]
     assert own['reached'] == {'1000': [None, None], '1': [None, None]}
-    assert set(result['controls']) == {'random actions', 'shortest path'}
+    assert set(result['controls']) == {'random actions', 'shortest path', 'blank goal'}
     assert result['controls']['shortest path']['decisions'] <= 12
     page, table = (kept / 'page.html').read_text(), (kept / 'table.md').read_text()
     assert 'not within' in page and 'vn_nav train' in page and str(tmp_path) not in table
