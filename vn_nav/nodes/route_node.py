@@ -310,7 +310,7 @@ class RouteNode(Node):
             self._enable.call_async(SetBool.Request(data=False))
 
     def _end(self, status: RouteStatus, message: str = '') -> None:
-        self._status, self._message, self._enables = status, message, None
+        self._status, self._message, self._enables, self._driven = status, message, None, None
         self._say()
 
     def _say(self) -> None:
