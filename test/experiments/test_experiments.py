@@ -24,8 +24,11 @@ from vn_nav.experiments.experiment import (
     slug,
 )
 from vn_nav.experiments.reproduction import Reproduction
+from vn_nav.report.chart import to_picture
+from vn_nav.report.compare import WIDTH, chart
 from vn_nav.report.curves import Run, reached, read_runs, thin
 from vn_nav.report.experiment_page import spread, write_results
+from vn_nav.report.page import CURVES
 from vn_nav.robot import load_robot
 
 SMALL = """
@@ -277,6 +280,15 @@ def test_a_thinned_curve_keeps_its_last_row(tmp_path):
     thin(tmp_path, tmp_path / 'kept')
     run, = read_runs([tmp_path / 'kept'])
     assert len(run.columns['frames']) <= 400 and run.columns['frames'][-1] == 1001
+
+
+def test_lines_of_controls_find_a_colour_beside_as_many_curves_as_there_are():
+    frames = np.arange(1.0, 101.0)
+    columns = {'frames': frames, 'minutes': frames, 'tau': np.ones(100),
+               'success': np.linspace(0, 1, 100)}
+    groups = {str(k): [Run(Path(str(k)), str(k), columns)] for k in range(CURVES)}
+    shapes, height = chart(groups, 'success', levels={'random': 0.1, 'shortest': 1.0})
+    assert to_picture(shapes, WIDTH, height).std() > 0
 
 
 def test_spread_is_not_of_some():

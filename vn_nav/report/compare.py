@@ -74,7 +74,8 @@ def chart(groups: dict[str, list[Run]], metric: str, band: str = 'range', log: b
         levels: names and values of horizontal lines.
     """
     levels = levels or {}
-    flat = [(label, f'c{k}') for k, label in enumerate(levels, start=len(groups))]
+    flat = [(label, f'c{k}' if k < CURVES else 'ink')  # one colour for what the curves left none
+            for k, label in enumerate(levels, start=len(groups))]
     names = [(f'{label} ({len(runs)} run{"s" * (len(runs) > 1)})', f'c{k}')
              for k, (label, runs) in enumerate(groups.items())]
     shapes, used = legend([*names, *flat], PANELS[0][0], 12, WIDTH - 16)
