@@ -19,9 +19,10 @@ import numpy as np
 from vn_msgs_py.images import ImageError, decode_depth, decode_labels, decode_rgb
 from vn_nav.bags.dataset import MAX_DEPTH, Wanted
 from vn_nav.bags.drive import Frame, Report, find_topics, synchronise, timestamped_messages
-from vn_nav.bags.goal_cameras import GoalCameras, goal_stamp, read_goal_cameras
+from vn_nav.bags.goal_cameras import GoalCameras, read_goal_cameras
 from vn_nav.bags.roles import Topics
 from vn_nav.bags.segmenter import NO_ACTION, ActionSegmenter, Step
+from vn_nav.bags.stamped import header_stamp
 from vn_nav.bags.storage.stream import messages, summary
 from vn_nav.calibration import is_rectified, read_calibration
 from vn_nav.errors import UserError
@@ -292,7 +293,7 @@ class _Goals:
     def _keep(self, message: Any) -> int:
         if message is None:
             return -1
-        other = self._others.get(goal_stamp(message))
+        other = self._others.get(header_stamp(message))
         target = self._wanted.robot.camera_fov
         try:
             picture, fov = flatten_goal(decode_rgb(message), self._camera, other)

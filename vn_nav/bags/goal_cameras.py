@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from vn_nav.bags.roles import Topics
+from vn_nav.bags.stamped import header_stamp
 from vn_nav.bags.storage.stream import messages
 from vn_nav.calibration import read_calibration
 from vn_nav.rectification import Camera
@@ -31,10 +31,5 @@ def read_goal_cameras(bag: str | Path, topics: Topics, target_fov: float) -> Goa
     for message in messages(bag, (topics.goal_camera_info,)):
         calibration = read_calibration(message.message)
         if calibration is not None:
-            found[goal_stamp(message.message)] = Camera(calibration, target_fov)
+            found[header_stamp(message.message)] = Camera(calibration, target_fov)
     return found
-
-
-def goal_stamp(message: Any) -> tuple[int, int]:
-    """By which a goal picture and its camera belong together."""
-    return message.header.stamp.sec, message.header.stamp.nanosec

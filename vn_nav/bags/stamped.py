@@ -117,3 +117,8 @@ class Stamped:
         near = [(run, pair) for run, pair in pairs
                 if min(abs(entry.stamp - stamp) for entry in pair) <= self._window]
         return min(near, key=lambda found: abs(found[1][0].time - time), default=None)
+
+
+def header_stamp(message: Any) -> tuple[int, int]:
+    """Seconds and nanoseconds of a message's header: by which a goal and its camera belong."""
+    return message.header.stamp.sec, message.header.stamp.nanosec

@@ -87,8 +87,11 @@ class Reproduction:
     def _check(self, arm: str, options: object, folder: Path) -> None:
         """Whether what is there was run with the options of now.
 
+        Args:
+            options: it was run with; None: nobody knows.
+
         Raises:
-            UserError: it was not; None: nobody knows.
+            UserError: it was not.
         """
         wanted = self.options(arm)
         if options is None or options == wanted:

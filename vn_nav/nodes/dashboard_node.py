@@ -29,6 +29,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from vn_msgs_py.images import ImageError, decode_rgb
 from vn_msgs_py.motion import MotionError, odometry_to_array
+from vn_nav.bags.stamped import header_stamp
 from vn_nav.dashboard.access import access
 from vn_nav.dashboard.pictures import jpeg
 from vn_nav.errors import UserError
@@ -211,7 +212,7 @@ class DashboardNode(Node):
         message, guesses, track = self._map, self._guesses, self._track
         if message is None or not track or not message.info.width:
             return None
-        shows = (_stamp(message), None if guesses is None else _stamp(guesses),
+        shows = (header_stamp(message), None if guesses is None else header_stamp(guesses),
                  *np.round(track[-1], 1))
         if shows != self._drawn[0]:
             self._drawn = shows, self._drawn[1] + 1
@@ -255,10 +256,6 @@ class DashboardNode(Node):
 
     def _show(self, picture: np.ndarray, fov: float | None) -> str:
         return f'goal shown: {self._goals.show(picture, fov)}'
-
-
-def _stamp(message: Any) -> tuple[int, int]:
-    return message.header.stamp.sec, message.header.stamp.nanosec
 
 
 def _jpeg(numbered: tuple[int, Any] | None) -> tuple[int, bytes] | None:

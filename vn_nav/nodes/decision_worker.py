@@ -13,6 +13,7 @@ import numpy as np
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Int8, String
 
+from vn_nav.bags.stamped import header_stamp
 from vn_nav.nodes.camera_pictures import CameraPictures, Prepared
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.goal_output import GoalOutput
@@ -159,7 +160,7 @@ class DecisionWorker:
         with self._wake:
             self._goal_camera = stamp, camera
             # Topics are not in order: the picture may have come first.
-            if self._goal_in_force is not None and _stamp(self._goal_in_force) == stamp:
+            if self._goal_in_force is not None and header_stamp(self._goal_in_force) == stamp:
                 self._take_goal_again()
 
     def _take_goal_again(self) -> None:
@@ -220,7 +221,7 @@ class DecisionWorker:
         self._runtime.set_goal(picture, view)
         with self._wake:
             if self._is_newest(message):
-                self.goal_output.stamp = sec, nanosec = _stamp(message)
+                self.goal_output.stamp = sec, nanosec = header_stamp(message)
                 again, self._accepted = message is self._accepted, message
                 self._navigator.accept_goal(sec + nanosec * 1e-9 if self._lock_step
                                             else -math.inf, again)
@@ -229,7 +230,7 @@ class DecisionWorker:
     def _refuse_goal(self, message: Image, why: str) -> None:
         if not self._is_newest(message):
             return
-        self.goal_output.stamp = _stamp(message)
+        self.goal_output.stamp = header_stamp(message)
         self._node.get_logger().error(f'goal_image refused: {shorten(why)}')
         self._navigator.refuse_goal(why)
         self.goal_output.publish()
@@ -340,8 +341,4 @@ class DecisionWorker:
 
     def _prepare_goal(self, message: Image) -> Prepared:
         stamp, camera = self._goal_camera or (None, None)
-        return self.pictures.goal(message, camera if stamp == _stamp(message) else None)
-
-
-def _stamp(message) -> tuple[int, int]:
-    return message.header.stamp.sec, message.header.stamp.nanosec
+        return self.pictures.goal(message, camera if stamp == header_stamp(message) else None)

@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Bool, Float32, String, UInt8
 
 from vn_msgs_py import images
-from vn_nav.bags.stamped import STAMP_WINDOW_S
+from vn_nav.bags.stamped import STAMP_WINDOW_S, header_stamp
 from vn_nav.calibration import is_rectified, read_calibration
 from vn_nav.nodes.command_output import CommandOutput
 from vn_nav.nodes.prepared import prepared
@@ -235,10 +235,10 @@ class Senses:
                 f'goal_camera_info refused: {shorten(str(error) or repr(error))}',
                 throttle_duration_sec=10.0)
             return
-        stamp, goal = (message.header.stamp.sec, message.header.stamp.nanosec), self._goal_message
+        stamp, goal = header_stamp(message), self._goal_message
         self._goal_camera = stamp, camera
         # Topics are not in order: the picture may have come first.
-        if goal is not None and (goal.header.stamp.sec, goal.header.stamp.nanosec) == stamp:
+        if goal is not None and header_stamp(goal) == stamp:
             picture = prepared(self._prepare_goal, goal, self._wake, self._refuse_goal)
             with self._wake:
                 if picture is not None and self._navigator.goal_ready:
@@ -282,9 +282,8 @@ class Senses:
 
     def _prepare_goal(self, message: Image) -> np.ndarray:
         stamp, other = self._goal_camera or (None, None)
-        if stamp != (message.header.stamp.sec, message.header.stamp.nanosec):
-            other = None
-        picture, fov = flatten_goal(images.decode_rgb(message), self.camera, other)
+        picture, fov = flatten_goal(images.decode_rgb(message), self.camera,
+                                    other if stamp == header_stamp(message) else None)
         return preprocess(picture, self._size, fov=fov, target_fov=self._robot.camera_fov)
 
     def _lens(self) -> dict[str, float]:

@@ -11,12 +11,12 @@ import numpy as np
 from vn_nav import __version__
 from vn_nav.arrival import ARRIVAL_HEADING, ARRIVAL_RADIUS
 from vn_nav.evaluation.bag_episodes import Drive, RecordedEpisode
-from vn_nav.evaluation.metrics import Episode, path_efficiency
+from vn_nav.evaluation.metrics import path_efficiency
 from vn_nav.report.maps import Journey, floor_map
 from vn_nav.report.page import cards, page, picture, table
 from vn_nav.report.search_map import Window, draw, known_bounds
 from vn_nav.report.tables import number
-from vn_nav.report.trial_page import section
+from vn_nav.report.trial_page import outcome, section
 from vn_nav.scenes import HOUSE, parse_scene
 
 STRIP = 9  # pictures of a film strip
@@ -117,16 +117,9 @@ not.</figcaption></figure>
 <details><summary>All {len(drive.episodes)} episodes</summary>{rows}</details>"""
 
 
-def _outcome(episode: Episode) -> tuple[str, str]:
-    """The class of its colour, and words."""
-    if episode.success:
-        return 'yes', 'arrived'
-    return 'no', 'false stop' if episode.declared else 'gave up'
-
-
 def _row(recorded: RecordedEpisode) -> list[str]:
     e = recorded.episode
-    kind, words = _outcome(e)
+    kind, words = outcome(e)
     return [html.escape(e.goal), f'<span class="{kind}">{words}</span>',
             str(recorded.facts['episode'] + 1), f'{e.start_distance:.1f}', f'{e.path_length:.1f}',
             f'{path_efficiency(e):.2f}', str(e.decisions), str(e.collisions),
@@ -151,7 +144,7 @@ def _journey(recorded: RecordedEpisode, plan: dict) -> str:
         f'<figure><img alt="" src="{picture(recorded.pictures[number])}">'
         f'<figcaption>{"decision " if k == 0 else ""}{number}</figcaption></figure>'
         for k, number in enumerate(numbers[i] for i in picked))
-    kind, words = _outcome(e)
+    kind, words = outcome(e)
     way = (f'\nfor a shortest way of {e.start_distance:.1f} m'
            if math.isfinite(e.start_distance) else '')  # else nobody knows it
     return f"""<div class="journey"><h3>To the {html.escape(e.goal)}:

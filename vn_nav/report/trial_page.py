@@ -67,7 +67,7 @@ def kept(result: dict, about: dict[str, str], drives: dict[str, list[Drive]]) ->
     """
     return {'result': result, 'about': about, 'scenes': [{
         'plan': {name: drive.scene[name] for name in PLAN if name in drive.scene},
-        'drives': [{'success': one.episode.success, 'outcome': _said(one.episode),
+        'drives': [{'success': one.episode.success, 'outcome': outcome(one.episode)[1],
                     'goal': [round(value, 2) for value in one.facts['goal_pose'][:3]],
                     'decisions': one.episode.decisions, 'seconds': round(one.episode.seconds),
                     'way': _thinned(one.trajectory).round(2).tolist()}
@@ -160,11 +160,15 @@ def _scene(drives: dict[str, Drive]) -> str:
 
 
 def _outcome(episode: Episode) -> str:
-    return f'<span class="{"yes" if episode.success else "no"}">{_said(episode)}</span>'
+    kind, words = outcome(episode)
+    return f'<span class="{kind}">{words}</span>'
 
 
-def _said(episode: Episode) -> str:
-    return 'arrived' if episode.success else 'false stop' if episode.declared else 'gave up'
+def outcome(episode: Episode) -> tuple[str, str]:
+    """The class of its colour, and words."""
+    if episode.success:
+        return 'yes', 'arrived'
+    return 'no', 'false stop' if episode.declared else 'gave up'
 
 
 def _map(drive: Drive) -> str:

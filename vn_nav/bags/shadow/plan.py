@@ -24,10 +24,11 @@ from vn_msgs_py.picture_file import DecodedPicture
 from vn_nav.bags.dataset import Wanted
 from vn_nav.bags.drive import Report, find_topics
 from vn_nav.bags.drive_decoder import read_steps
-from vn_nav.bags.goal_cameras import GoalCameras, goal_stamp, read_goal_cameras
+from vn_nav.bags.goal_cameras import GoalCameras, read_goal_cameras
 from vn_nav.bags.roles import COMPRESSED, Topics, full_name
 from vn_nav.bags.segmenter import NO_ACTION
 from vn_nav.bags.shadow.ranges import Ranges, RangesBeside, find_ranges
+from vn_nav.bags.stamped import header_stamp
 from vn_nav.bags.storage.decoding import Decoder
 from vn_nav.bags.storage.stream import Bag, summary
 from vn_nav.errors import UserError
@@ -157,7 +158,7 @@ class Goals:
         """
         picture, fov = None if goal is None else _picture(goal), None
         self.shown += picture is not None
-        if picture is not None and (camera := self._cameras.get(goal_stamp(goal))) is not None:
+        if picture is not None and (camera := self._cameras.get(header_stamp(goal))) is not None:
             picture, fov = camera.rectify(picture), camera.fov
         if picture is None and self._everywhere is None:
             picture = _picture(last)
