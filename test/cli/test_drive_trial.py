@@ -1,12 +1,14 @@
 """`vn_nav drive-trial` for real, small: both bases, over ROS, and what is counted of them."""
 
 import json
+import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from ros_harness import write_checkpoint
 
-from vn_nav.cli import main
+from vn_nav.cli import drive_trial, main
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.report.trial_page import section
 
@@ -43,6 +45,24 @@ def test_both_bases_are_driven_once_and_counted_from_their_bags(tmp_path, capsys
     assert main(words) == 0
     assert time.monotonic() - begun < 10, 'nothing is driven again'
     assert '2 episodes of each base' in capsys.readouterr().out
+
+
+def test_a_job_that_is_free_takes_the_next_leg(tmp_path, monkeypatch):
+    legs = [drive_trial.Leg('harsh', f'house:{k}', k, 1) for k in range(6)]
+    others, others_done, by_domain = set(legs[1:]), threading.Event(), {}
+
+    def drive_one(self, leg, domain, ended):
+        by_domain.setdefault(domain, []).append(leg)
+        others.discard(leg)
+        if not others:
+            others_done.set()
+        if leg == legs[0]:  # takes as long as all the others together
+            assert others_done.wait(30)
+
+    monkeypatch.setattr(drive_trial._Driver, '_drive_one', drive_one)
+    driver = drive_trial._Driver(tmp_path, tmp_path, SimpleNamespace(info={}), tmp_path, {}, {})
+    driver.drive(legs, 2)
+    assert sorted(map(len, by_domain.values())) == [1, 5]
 
 
 @pytest.mark.parametrize('words, what', [

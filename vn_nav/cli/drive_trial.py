@@ -8,6 +8,7 @@ import dataclasses
 import datetime
 import json
 import os
+import queue
 import shutil
 import signal
 import threading
@@ -220,9 +221,13 @@ class _Driver:
                 if finished(self._out / f'{leg.name}.json', self._wanted(leg)) is None]
         ended = threading.Event()
         domains = [40 + (os.getpid() + job) % 60 for job in range(jobs)]
+        # One queue: a leg in real time takes many times as long as one in lock-step.
+        waiting = queue.SimpleQueue[Leg]()
+        for leg in left:
+            waiting.put(leg)
         with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
-            running = [pool.submit(self._drive_several, left[job::jobs], domains[job], ended)
-                       for job in range(jobs)]
+            running = [pool.submit(self._drive_several, waiting, domain, ended)
+                       for domain in domains]
             try:
                 concurrent.futures.wait(
                     running, return_when=concurrent.futures.FIRST_EXCEPTION)
@@ -236,10 +241,14 @@ class _Driver:
         return self._conditions | dataclasses.asdict(leg) | {
             'bridge': BASES[leg.base].bridge, 'policy': BASES[leg.base].policy | parameters}
 
-    def _drive_several(self, legs: Sequence[Leg], domain: int, ended: threading.Event) -> None:
-        for leg in legs:
-            if not ended.is_set():
-                self._drive_one(leg, domain, ended)
+    def _drive_several(self, waiting: queue.SimpleQueue[Leg], domain: int,
+                       ended: threading.Event) -> None:
+        while not ended.is_set():
+            try:
+                leg = waiting.get_nowait()
+            except queue.Empty:
+                return
+            self._drive_one(leg, domain, ended)
 
     def _drive_one(self, leg: Leg, domain: int, ended: threading.Event) -> None:
         from vn_nav.evaluation.kept import keep
