@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -114,6 +115,15 @@ def built():
 
 
 @pytest.fixture
+def with_action(built, monkeypatch):
+    """Nodes that are started serve the action; the environment for its client."""
+    for name in ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'LD_LIBRARY_PATH', 'CMAKE_PREFIX_PATH'):
+        if name in built:
+            monkeypatch.setenv(name, built[name])
+    return built
+
+
+@pytest.fixture
 def robot():
     rclpy.init()
     robot = FakeRobot(odometry=RELIABLE)
@@ -122,12 +132,13 @@ def robot():
     rclpy.shutdown()
 
 
-def results(robot, environment, goals):
+def results(robot, environment, goals, meanwhile=lambda: None):
     """What a client hears of goals that it sends, while the robot goes on."""
     client = subprocess.Popen([sys.executable, TESTS / 'image_action.py', json.dumps(goals)],
                               env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                               text=True)
     try:
+        meanwhile()
         wait_until(lambda: client.poll() is not None, robot.spin, 300)
         said, error = client.communicate(timeout=60)
     finally:
@@ -139,17 +150,14 @@ def results(robot, environment, goals):
 @pytest.mark.ros
 @pytest.mark.slow
 @pytest.mark.timeout(interface_build.BUILD_SECONDS + 400)
-def test_goals_of_the_action_arrive_fail_and_are_cancelled(built, robot, tmp_path, monkeypatch):
+def test_goals_of_the_action_arrive_fail_and_are_cancelled(with_action, robot, tmp_path):
     """policy_node, a robot of topics, and a client: three processes."""
-    for name in ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'LD_LIBRARY_PATH', 'CMAKE_PREFIX_PATH'):
-        if name in built:
-            monkeypatch.setenv(name, built[name])
     picture = tmp_path / 'goal.png'
     cv2.imwrite(str(picture), np.zeros((84, 84, 3), np.uint8))
     with child('vn_nav.nodes.policy_node', tmp_path / 'log',
                checkpoint=write_checkpoint(tmp_path / 'unsure'), **PATIENT):
         nowhere = {'path': str(tmp_path / 'none.png')}
-        used_up, none, cancelled, replaced = results(robot, built, [
+        used_up, none, cancelled, replaced = results(robot, with_action, [
             {'max_decisions': 2}, nowhere, {'cancel_after': 4.0},
             {'interrupted_by': nowhere, 'after': 4.0}])
         # The goal before is over: the robot has none, and stands.
@@ -166,9 +174,24 @@ def test_goals_of_the_action_arrive_fail_and_are_cancelled(built, robot, tmp_pat
     assert replaced['other']['code'] == Code.GOAL_REFUSED
     sure = write_checkpoint(tmp_path / 'sure', arrival=0.93, stop_threshold=0.5)
     with child('vn_nav.nodes.policy_node', tmp_path / 'log2', checkpoint=sure, **PATIENT):
-        (there,) = results(robot, built, [{'path': str(picture)}])
+        (there,) = results(robot, with_action, [{'path': str(picture)}])
     assert (there['status'], there['code'], there['decisions']) == (SUCCEEDED, 0, 1), there
     assert there['arrival'] == pytest.approx(0.93, abs=0.01)
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.timeout(interface_build.BUILD_SECONDS + 400)
+def test_a_client_hears_that_the_node_ends(with_action, robot, tmp_path):
+    unsure = write_checkpoint(tmp_path / 'unsure')
+    with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=unsure, **PATIENT) as node:
+        def end():
+            wait_until(robot.moving, robot.spin, 100)
+            node.send_signal(signal.SIGINT)
+
+        (left,) = results(robot, with_action, [{}], meanwhile=end)
+    assert (left['status'], left['code'], left['message']) == (
+        ABORTED, Code.STOPPED, 'the process ends')
 
 
 @pytest.mark.ros

@@ -47,7 +47,7 @@ class _Server(ActionServer):
         """Called when a goal becomes active; `finish` calls back."""
 
     def finish(self, goal_handle, result) -> None:
-        """Send the result of a goal."""
+        """Send the result of a goal: two tasks of the executor do that."""
         super().notify_execute(goal_handle, lambda _: result)
 
 
@@ -85,10 +85,13 @@ class NavigateAction:
             cancel_callback=lambda _: CancelResponse.ACCEPT)
 
     def destroy(self) -> None:
-        """Take it off the graph; a goal under way is aborted."""
-        if self._handle is not None:
-            self._finish(Status.FAILED, Code.STOPPED, 'the node is configured anew')
+        """Take it off the graph."""
         self._server.destroy()
+
+    def halt(self, reason: str) -> None:
+        """Abort the goal under way, if any: the node stops acting."""
+        if self._handle is not None:
+            self._finish(Status.FAILED, Code.STOPPED, reason)
 
     def _on_goal(self, request) -> GoalResponse:
         if not self._accepts():

@@ -9,6 +9,7 @@ Run: `ros2 run vn_nav policy_node --ros-args -p checkpoint:=models/house`.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
 import time
@@ -40,6 +41,7 @@ from vn_nav.robot import RobotSpec, load_robot
 # The watchdog's limits in a shadow: nothing moves, and a busy machine may take its time.
 SHADOW_LIMIT_S = 30.0
 DECISION_END_TIMEOUT_S = 5.0  # for a decision under way when the node ends
+LAST_TURNS = 20  # of the executor, to send what a goal ended with when the process ends
 
 
 class PolicyNode(LifecycleNode):
@@ -259,6 +261,8 @@ class PolicyNode(LifecycleNode):
         threads.join('output')  # it waits for nothing but `wake`
         self._output.deliver_zero()  # the output thread is gone: still only one owner
         self._worker.publish_last()
+        with self._wake:
+            self._operation.halt(reason)
         ended = threads.join('inference', DECISION_END_TIMEOUT_S)
         if not ended:
             self.get_logger().error(f'a decision did not end within {DECISION_END_TIMEOUT_S:g} s')
@@ -309,6 +313,10 @@ def drive(node: PolicyNode, ended: Ended) -> None:
             node.get_logger().error(f'{node.broken}; going inactive: activate it again')
             if node.is_running:
                 node.trigger_deactivate()
+    node.close()
+    with contextlib.suppress(Exception):  # nothing that fails now is of use to anyone
+        for _ in range(LAST_TURNS):
+            executor.spin_once(timeout_sec=0.0)
 
 
 def _transit(node: PolicyNode, transition) -> None:

@@ -61,6 +61,11 @@ class Operation:
                 lambda: self._node.is_running, worker.goal_output)
         self._timer = node.create_timer(TIMER_PERIOD_S, self._on_timer, clock=steady)
 
+    def halt(self, reason: str) -> None:
+        """Tell the client of an action that the node stops acting."""
+        if self._action is not None:
+            self._action.halt(reason)
+
     def end(self) -> None:
         """Take all of it off the graph."""
         self._ended = True
