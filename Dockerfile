@@ -25,7 +25,7 @@ RUN apt-get update \
     && rosdep update --rosdistro jazzy \
     && rosdep install --from-paths src --ignore-src -y --rosdistro jazzy \
         --dependency-types exec --skip-keys "python3-gymnasium-pip python3-numba python3-numpy \
-        python3-opencv python3-rich python3-rosbags-pip python3-torch" \
+        python3-onnxruntime-pip python3-opencv python3-rich python3-rosbags-pip python3-torch" \
     && rm -rf /var/lib/apt/lists/*
 
 USER robot
@@ -41,7 +41,7 @@ RUN python3 -m venv --system-site-packages "$VIRTUAL_ENV" \
 # `python -m colcon`: the executables start with the environment's interpreter.
 COPY --chown=robot . src/vn_nav
 RUN . /opt/ros/jazzy/setup.bash \
-    && python -m colcon build --packages-select vn_nav
+    && python -m colcon build --base-paths src src/vn_nav/vn_interfaces
 
 ENTRYPOINT ["/bin/bash", "-c", "source \"$WORKSPACE/install/setup.bash\" && exec \"$@\"", "--"]
 CMD ["ros2", "run", "vn_nav", "vn_nav", "--help"]

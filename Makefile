@@ -35,6 +35,7 @@ unexport $(SHADOWS)
 export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 # Pictures pass whole, and nothing leaves this host (see the profile).
 export FASTRTPS_DEFAULT_PROFILES_FILE := $(CURDIR)/config/fastdds_localhost.xml
+export FASTDDS_DEFAULT_PROFILES_FILE := $(CURDIR)/config/fastdds_localhost.xml
 export ROS_AUTOMATIC_DISCOVERY_RANGE := SYSTEM_DEFAULT
 
 .PHONY: demo test test-all soak lint docs figures clean

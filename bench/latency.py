@@ -36,6 +36,7 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import Image
 
 from vn_msgs_py.images import fill_image
+from vn_nav.nodes.isolation import profile_environment
 from vn_nav.nodes.qos import qos
 from vn_nav.resources import share_file
 
@@ -212,8 +213,7 @@ def main() -> int:
     if options.fifo:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(5))  # children inherit it
     # Fast DDS's usual shared memory is smaller than a picture: many would be lost.
-    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE',
-                          str(share_file('config/fastdds_localhost.xml')))
+    os.environ.update(profile_environment())
     from vn_nav.policy.checkpoint import load_checkpoint
     from vn_nav.policy.export import export_onnx
     with tempfile.TemporaryDirectory() as folder:

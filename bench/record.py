@@ -25,7 +25,7 @@ import numpy as np
 from common import pin, report
 from mcap.reader import make_reader
 
-from vn_nav.resources import share_file
+from vn_nav.nodes.isolation import profile_environment
 
 RECORDER = 'vn_nav.nodes.recorder_node'
 TOPICS = ('/image_raw', '/depth/image_raw', '/odom')
@@ -84,9 +84,7 @@ def cpu_seconds(process: int) -> float:
 
 def measure(seconds: float, size: tuple[int, int], rate: float) -> None:
     """Record what a publisher sends, count what is in the bag."""
-    environment = os.environ | {
-        'FASTRTPS_DEFAULT_PROFILES_FILE': str(share_file('config/fastdds_localhost.xml')),
-        'OMP_NUM_THREADS': '1'}
+    environment = os.environ | profile_environment() | {'OMP_NUM_THREADS': '1'}
     with tempfile.TemporaryDirectory(dir='.') as folder:
         bag, log = Path(folder, 'bag'), Path(folder, 'log')
         with open(log, 'w') as file:

@@ -27,6 +27,7 @@ from vn_nav.learning.distributed import Processes
 from vn_nav.learning.over_ros import config_over_ros
 from vn_nav.learning.presets import ENVIRONMENT, preset
 from vn_nav.learning.training import Training
+from vn_nav.nodes.isolation import profile_environment
 from vn_nav.resources import share_file
 from vn_nav.robot import DRIVE_ACTIONS, load_robot
 from vn_nav.scenes import house_scenes
@@ -72,7 +73,7 @@ def main():
     parser.add_argument('--updates', type=int, default=2, help='a round')
     arguments = parser.parse_args()
     # What rclpy reads when it is imported; the bridge inherits it.
-    os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(share_file('config/fastdds_localhost.xml'))
+    os.environ |= profile_environment()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
     os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 60))
     from vn_nav.nodes.ros_env import RosEnv

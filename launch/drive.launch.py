@@ -27,7 +27,8 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+# Fast DDS 2 (Jazzy) reads the first alone, Fast DDS 3 (Kilted, Lyrical) the second.
+PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 BAD_INPUT = 2  # exit code: starting again would not help
 RESPAWN_DELAY = 2.0  # s
 
@@ -35,6 +36,7 @@ RESPAWN_DELAY = 2.0  # s
 def generate_launch_description():
     """Describe the arguments, the environment and the node."""
     config = PathJoinSubstitution([FindPackageShare('vn_nav'), 'config'])
+    usual = PathJoinSubstitution([config, 'fastdds_multihost.xml'])
     return LaunchDescription([
         DeclareLaunchArgument(
             'namespace', default_value='', description='Namespace of the node and its topics'),
@@ -54,8 +56,9 @@ def generate_launch_description():
             'log_level', default_value='info', description='debug, info, warn, error or fatal'),
         # The camera driver needs a profile like this one too, or frames are lost. A user's own
         # profile, and that of sim.launch.py, stay.
-        SetEnvironmentVariable(PROFILE, EnvironmentVariable(
-            PROFILE, default_value=PathJoinSubstitution([config, 'fastdds_multihost.xml']))),
+        *(SetEnvironmentVariable(name, EnvironmentVariable(
+            name, default_value=[EnvironmentVariable(other, default_value=usual)]))
+          for name, other in (PROFILES, PROFILES[::-1])),
         OpaqueFunction(function=_start),
     ])
 

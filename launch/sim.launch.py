@@ -66,7 +66,9 @@ def generate_launch_description():
     )
     return LaunchDescription([
         *arguments,
+        # Fast DDS 2 (Jazzy) reads the first alone, Fast DDS 3 (Kilted, Lyrical) the second.
         SetEnvironmentVariable('FASTRTPS_DEFAULT_PROFILES_FILE', profile),
+        SetEnvironmentVariable('FASTDDS_DEFAULT_PROFILES_FILE', profile),
         # ROS adds no peers and no interfaces of its own to those of the profile.
         SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SYSTEM_DEFAULT'),
         # Absolute names would be those of every robot: into the namespace, for both nodes.

@@ -14,7 +14,8 @@ ROOT = Path(__file__).resolve().parent.parent
 DOMAINS = range(1, 102)  # all that leave Linux's ephemeral ports alone, less the default 0
 
 # Set at import: rclpy reads them once, and the processes that tests start inherit them.
-os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(ROOT / 'config' / 'fastdds_localhost.xml')
+for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
+    os.environ[name] = str(ROOT / 'config' / 'fastdds_localhost.xml')
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
 # Under `nohup` or `timeout` SIGHUP is ignored, also by the nodes that tests start, which then do
 # not end by it. A handler is no matter of theirs.

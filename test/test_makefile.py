@@ -83,6 +83,7 @@ def test_a_sourced_ros_stays_outside(folder):
     ours = {
         'AMENT_PREFIX_PATH': str(folder / '.venv'),
         'FASTRTPS_DEFAULT_PROFILES_FILE': str(folder / 'config' / 'fastdds_localhost.xml'),
+        'FASTDDS_DEFAULT_PROFILES_FILE': str(folder / 'config' / 'fastdds_localhost.xml'),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
         'ROS_DOMAIN_ID': '42',
     }

@@ -47,7 +47,7 @@ def read_goal_picture(path: Path) -> DecodedPicture:
         return decode_with_lens(data, smallest=KEPT_SIDE_PX, largest=MAX_JPEG_PX)
     except MissingExtraError as error:
         raise UserError("a HEIC goal picture is read with the extra 'heic', pillow-heif",
-                        str(path), f"pip install 'vn_nav[heic]', or "
+                        str(path), f"pip install pillow-heif, or "
                         f"{_conversion(path, 'HEIC')}") from error
     except ForeignFormatError as error:
         kind = _received(data, error)

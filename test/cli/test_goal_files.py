@@ -124,7 +124,7 @@ def test_other_formats_are_named_with_the_command(tmp_path, monkeypatch):
     path = tmp_path / 'IMG 1.HEIC'
     path.write_bytes(HEIC)
     refused(path, 'HEIC', f"`convert 'heic:{path}' '{path.with_suffix('.jpg')}'`",
-            "pip install 'vn_nav[heic]'")
+            'pip install pillow-heif')
     path = tmp_path / 'goal.jpg'  # the name says nothing
     path.write_bytes(b'RIFF\0\0\0\0WEBPVP8 ')
     refused(path, 'WebP', f"`convert 'webp:{path}[0]' ")

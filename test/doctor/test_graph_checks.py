@@ -5,11 +5,13 @@ import math
 
 import numpy as np
 import pytest
+import yaml
 from paths import ROOT
 
 from vn_msgs_py.topics import BEST_EFFORT, LATCHED, RELIABLE, VOLATILE, topic
 from vn_nav.doctor.camera_checks import Policy
 from vn_nav.doctor.checks import examine
+from vn_nav.doctor.drive_checks import is_command_timeout
 from vn_nav.doctor.page import graph_page
 from vn_nav.doctor.seen import (
     ERROR,
@@ -124,6 +126,11 @@ FAULTS = {
                           'middleware', ERROR, '/gone.xml does not exist', 'fastdds_multihost'),
     'no profile': (graph(middleware=Middleware('rmw_fastrtps_cpp')), 'middleware', WARNING,
                    '0.9 MB', f'{share_file("config/fastdds_multihost.xml")}'),
+    'a profile that is not read': (
+        graph(middleware=Middleware('rmw_fastrtps_cpp',
+                                    ignored_variable='FASTDDS_DEFAULT_PROFILES_FILE')),
+        'middleware', WARNING, 'does not read',
+        'export FASTRTPS_DEFAULT_PROFILES_FILE=$FASTDDS_DEFAULT_PROFILES_FILE'),
     'two middlewares': (graph(seen('odom', [end('base', 'odom', vendor='Cyclone DDS')],
                                    [end('rviz', 'odom', vendor='Fast DDS')], ODOMETRY)),
                         'middleware', WARNING, 'Cyclone DDS: /base', 'RMW_IMPLEMENTATION='),
@@ -223,6 +230,24 @@ def test_simulated_time_is_judged_by_its_clock():
     findings = examine(simulated)
     assert {f.severity for f in findings} == {OK}
     assert any('use_sim_time:=true' in f.fix for f in findings)
+
+
+def names_of(parameters, before=''):
+    for name, value in parameters.items():
+        if isinstance(value, dict):
+            yield from names_of(value, f'{before}{name}.')
+        else:
+            yield before + name
+
+
+def test_a_time_out_of_commands_is_told_from_others():
+    """By the files that we give: a time-out of twist_mux's lock would hold the robot for ever."""
+    taken = {name for path in (ROOT / 'config' / 'graph').glob('*.yaml')
+             for node in yaml.safe_load(path.read_text()).values()
+             for name in names_of(node['ros__parameters']) if is_command_timeout(name)}
+    assert taken == {'topics.policy.timeout', 'topics.joystick.timeout', 'velocity_timeout'}
+    assert all(map(is_command_timeout, ('cmd_vel_timeout', 'cmd_timeout', 'timeout',
+                                        'drive.watchdog_timeout')))
 
 
 def test_a_base_that_stops_by_itself_is_trusted_over_parameters():

@@ -15,6 +15,7 @@ import rclpy
 from fake_robot import RELIABLE, FakeRobot
 from paths import ROOT, TESTS
 from ros_harness import child, wait_until, write_checkpoint
+from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.policy.goal_record import Code
 
@@ -182,16 +183,23 @@ def test_goals_of_the_action_arrive_fail_and_are_cancelled(with_action, robot, t
 @pytest.mark.ros
 @pytest.mark.slow
 @pytest.mark.timeout(interface_build.BUILD_SECONDS + 400)
-def test_a_client_hears_that_the_node_ends(with_action, robot, tmp_path):
+def test_a_client_hears_that_a_person_or_the_process_ends_it(with_action, robot, tmp_path):
     unsure = write_checkpoint(tmp_path / 'unsure')
     with child('vn_nav.nodes.policy_node', tmp_path / 'log', checkpoint=unsure, **PATIENT) as node:
-        def end():
-            wait_until(robot.moving, robot.spin, 100)
-            node.send_signal(signal.SIGINT)
+        for end, words in ((lambda: robot.call(SetBool, 'enable', data=False), 'disabled'),
+                           (lambda: robot.call(Trigger, 'stop'), '~/stop'),
+                           (lambda: node.send_signal(signal.SIGINT), 'the process ends')):
+            def end_motion(end=end):
+                wait_until(robot.moving, robot.spin, 100)
+                end()
 
-        (left,) = results(robot, with_action, [{}], meanwhile=end)
-    assert (left['status'], left['code'], left['message']) == (
-        ABORTED, Code.STOPPED, 'the process ends')
+            (left,) = results(robot, with_action, [{}], meanwhile=end_motion)
+            assert (left['status'], left['code']) == (ABORTED, Code.STOPPED), left
+            assert words in left['message']
+            if robot.moving():
+                robot.commands.clear()
+            if '~/stop' in words:
+                assert robot.call(Trigger, 'reset').success
 
 
 @pytest.mark.ros

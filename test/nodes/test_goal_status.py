@@ -1,19 +1,25 @@
 """How a goal ends, as policy_node says it on topics; and by the action, where it can be built."""
 
 import json
+import math
 import signal
 import time
 
+import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from fake_robot import RELIABLE, FakeRobot
 from geometry_msgs.msg import PoseStamped
 from ros_harness import child, wait_until, write_checkpoint
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool, Trigger
 
+from vn_nav.nodes.goal_output import GoalOutput
 from vn_nav.nodes.qos import qos
 from vn_nav.policy.goal_record import Code
+from vn_nav.policy.navigator import Limits, Navigator
+from vn_nav.robot import RobotSpec
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
@@ -31,6 +37,23 @@ def robot():
     yield robot
     robot.close()
     rclpy.shutdown()
+
+
+def test_the_estimate_is_a_pose_in_the_frame_of_odometry(robot):
+    """A goal 1 m ahead of a robot at (2, 3) that looks along +y; then without odometry."""
+    output = GoalOutput(robot.node, Navigator(RobotSpec(), Limits(1.0, 1.0)))
+    wait_until(lambda: output.publishers[2].get_subscription_count(), robot.spin)
+    ahead, stamp = np.array([1.0, 0.0, math.pi / 2]), Time(sec=7, nanosec=5)
+    output.decided(0.4, ahead, np.array([2.0, 3.0, math.pi / 2]), 'robot2/odom', stamp)
+    wait_until(lambda: robot.guessed, robot.spin)
+    output.decided(0.4, None, None, 'robot2/odom', stamp)  # no idea: nothing
+    output.decided(0.4, ahead, None, '', stamp)
+    wait_until(lambda: robot.guessed[1:], robot.spin)
+    by_odometry, by_robot = robot.guessed
+    assert by_odometry.header == Header(stamp=stamp, frame_id='robot2/odom')
+    place, turn = by_odometry.pose.position, by_odometry.pose.orientation
+    assert (place.x, place.y, abs(turn.z)) == pytest.approx((2.0, 4.0, 1.0))
+    assert by_robot.header.frame_id == 'base_link' and by_robot.pose.position.x == 1.0
 
 
 def until(robot, status, number=None):

@@ -49,6 +49,7 @@ PANELS = {'Displays', 'Selection', 'Tool Properties', 'Views', 'Time', 'Transfor
 READS = {'Map': 'nav_msgs/msg/OccupancyGrid', 'Image': 'sensor_msgs/msg/Image',
          'LaserScan': 'sensor_msgs/msg/LaserScan', 'Odometry': 'nav_msgs/msg/Odometry',
          'PoseArray': 'geometry_msgs/msg/PoseArray',
+         'Pose': 'geometry_msgs/msg/PoseStamped',
          'TwistStamped': 'geometry_msgs/msg/Twist'}  # with enable_stamped_cmd_vel
 
 
@@ -289,3 +290,11 @@ def test_the_managers_bring_up_the_chain_and_the_policy():
     ours, = (words for words in commands(ROOT / 'config/graph/lifecycle_manager.yaml')
              if words[2] == 'vn_nav')
     assert options(ours, '-p')['autostart'] == 'false', 'else it configures itself'
+
+
+def test_the_readme_has_every_parameter_with_its_default():
+    rows = re.findall(r'^\| (`[^|]+) \|([^|]*)\|', (ROOT / 'README.md').read_text(), re.MULTILINE)
+    listed = {name: defaults for names, defaults in rows for name in re.findall(r'`(\w+)`', names)}
+    for name, (default, *_) in {**BRIDGE, **POLICY}.items():
+        shown = json.dumps(default).strip('"') or '""'
+        assert name in listed and (shown in listed[name] or name == 'scene'), name

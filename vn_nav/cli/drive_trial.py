@@ -19,11 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 from vn_nav.cli import demo
 from vn_nav.errors import UserError
+from vn_nav.resources import share_file
 
 if TYPE_CHECKING:
     from vn_nav.policy.checkpoint import LoadedCheckpoint
 
 SEED = 2027  # of the first scene's starts, goals and light; the next one's is the next
+ROBOT = 'config/robots/harsh_base.yaml'
 PAGE, RESULT = 'page.html', 'result.json'
 # s without a finished episode after which a leg gives up: of its own, and of each decision.
 STALL, SLOWEST = 60.0, 5.0
@@ -84,7 +86,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--scene', action='append', metavar='NAME', help='these instead; may be '
                         'given several times')
     parser.add_argument('--bases', nargs='+', choices=BASES, default=list(BASES))
-    parser.add_argument('--robot', default='config/robots/harsh_base.yaml', metavar='YAML',
+    parser.add_argument('--robot', default=ROBOT, metavar='YAML',
                         help='limits of both bases (default %(default)s)')
     parser.add_argument('--max-decisions', type=int, default=300)
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='a '
@@ -103,11 +105,11 @@ def run(args: argparse.Namespace) -> int:
         UserError: bad options; a node that died, or a base that stalled.
     """
     from vn_nav.cli.world import load_for_scenes, machine
+    from vn_nav.evaluation.kept import planner
     from vn_nav.files import write_file
     from vn_nav.nodes.isolation import stay_on_this_host
     from vn_nav.report.terminal import print_table
     from vn_nav.report.trial_page import kept, trial_page
-    from vn_nav.resources import share_file
     if args.keep and 'harsh' not in args.bases:
         raise UserError('--keep keeps the ways of the harsh base', args.bases,
                         'leave out --bases, or --keep')
@@ -120,9 +122,12 @@ def run(args: argparse.Namespace) -> int:
     checkpoint = load_for_scenes(folder)[0]
     scenes = _scenes(args, checkpoint)
     robot = Path(args.robot)
-    robot = robot if robot.exists() else share_file(args.robot)
-    wanted = {'sha256': checkpoint.info['sha256'], 'robot': robot.read_text(),
-              'max_decisions': args.max_decisions}
+    if not robot.exists():
+        if args.robot != ROBOT:
+            raise UserError('--robot names a YAML file', args.robot, 'correct it')
+        robot = share_file(ROBOT)
+    wanted = {'sha256': checkpoint.info['sha256'], 'planner': planner(),
+              'robot': robot.read_text(), 'max_decisions': args.max_decisions}
     extra = _parameters(args.set)
     args.out.mkdir(parents=True, exist_ok=True)
     legs = _legs(args.bases, scenes, args.episodes)
@@ -237,9 +242,14 @@ class _Driver:
             one.result()
 
     def _wanted(self, leg: Leg) -> dict:
+        from vn_sim_bridge.render.randomisation import load_randomisation
         parameters = self._extra if leg.base == 'harsh' else {}
+        base = BASES[leg.base]
+        varied = base.bridge.get('randomisation', self._info['randomisation'])
         return self._conditions | dataclasses.asdict(leg) | {
-            'bridge': BASES[leg.base].bridge, 'policy': BASES[leg.base].policy | parameters}
+            'bridge': base.bridge, 'policy': base.policy | parameters,
+            'randomisation': json.loads(json.dumps(dataclasses.asdict(
+                load_randomisation(varied))))}
 
     def _drive_several(self, waiting: queue.SimpleQueue[Leg], domain: int,
                        ended: threading.Event) -> None:

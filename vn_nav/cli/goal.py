@@ -11,8 +11,8 @@ from vn_nav.errors import UserError
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `vn_nav goal`."""
     parser.description = ('Tell a running route_node where to drive, and wait until it is there. '
-                          'Exit code 0: it is there, 1: it is not, 2: bad usage. Ctrl-C stops the '
-                          'robot.')
+                          'Exit code 0: it is there, 1: it is not, 2: bad usage, 130: Ctrl-C, '
+                          'which stops the robot.')
     parser.add_argument('place', nargs='?', metavar='PLACE',
                         help='name, or number of a picture; left out: list the places')
     parser.add_argument('--no-wait', action='store_true', help='say it, and end')

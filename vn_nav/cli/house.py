@@ -22,8 +22,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         if name != 'export':
             action.add_argument('--scene', metavar='NAME', help='another scene, of any simulator')
             action.add_argument('--randomisation', default='none' if out else 'standard',
-                                metavar='NAME', help='of light and camera: none, standard, rough '
-                                'or a YAML file')
+                                metavar='NAME', help='of light and camera: none, standard, rough, '
+                                'harsh or a YAML file')
         if out:
             action.add_argument('--out', type=Path, help=f'file (default house-SEED.{out})')
         if name == 'export':

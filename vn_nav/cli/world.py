@@ -37,7 +37,8 @@ def add_world(parser: argparse.ArgumentParser, defaults: bool = True) -> None:
     parser.add_argument('--robot', type=Path, metavar='YAML',
                         help='robot file (config/robots/); default: the standard robot')
     parser.add_argument('--randomisation', default='none' if defaults else None, metavar='NAME',
-                        help='of light, camera and base: none, standard, rough or a YAML file')
+                        help='of light, camera and base: none, standard, rough, harsh or a YAML '
+                        'file')
     parser.add_argument('--seed', type=int, default=0 if defaults else 10_000)
 
 

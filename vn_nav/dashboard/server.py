@@ -6,6 +6,7 @@ What it shows and does is a `Robot`; `nodes/dashboard_node` is one.
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import json
 import os
@@ -122,6 +123,9 @@ class _Server:
     def __init__(self, robot: Robot, access: Access, camera_rate: float):
         self._robot, self._access, self._camera_s = robot, access, 1 / camera_rate
         self._watchers = 0
+        # A stop waits behind nothing: its thread does nothing else.
+        self._stops = concurrent.futures.ThreadPoolExecutor(1, 'stop')
+        self._acting = False  # something else than a stop waits for its answer
 
     @web.middleware
     async def guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -159,7 +163,22 @@ class _Server:
 
     async def act(self, request: web.Request) -> web.Response:
         """Enable, stop, reset."""
-        done, said = await asyncio.to_thread(self._robot.ask, request.path.lstrip('/'))
+        name = request.path.lstrip('/')
+        if name != 'stop':
+            return await self._answer(self._robot.ask, name)
+        done, said = await asyncio.get_running_loop().run_in_executor(
+            self._stops, self._robot.ask, name)
+        return web.json_response({'done': done, 'message': said})
+
+    async def _answer(self, act: Callable[[str], tuple[bool, str]], what: str) -> web.Response:
+        """What an act of the robot answers; one at a time, so that none comes after a stop."""
+        if self._acting:
+            return _refused('what was asked before still waits for its answer')
+        self._acting = True
+        try:
+            done, said = await asyncio.to_thread(act, what)
+        finally:
+            self._acting = False
         return web.json_response({'done': done, 'message': said})
 
     async def place(self, request: web.Request) -> web.Response:
@@ -168,8 +187,7 @@ class _Server:
             place = (await request.read()).decode()
         except ValueError:
             return _refused('the name of a place is UTF-8')
-        done, said = await asyncio.to_thread(self._robot.drive_to, place)
-        return web.json_response({'done': done, 'message': said})
+        return await self._answer(self._robot.drive_to, place)
 
     async def upload(self, request: web.Request) -> web.Response:
         """A goal from a file that the browser sends: the body is the file."""

@@ -9,6 +9,8 @@ from vn_nav.doctor.seen import ERROR, OK, OUR_DRIVERS, WARNING, Endpoint, Findin
 LONGEST_STOP_S = 1.0  # from the last command to rest, of a base that stops by itself
 MIN_TURN_RAD = 0.05  # that a base which hears commands has turned in the trial
 TWIST, STAMPED = 'geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'
+# In the name of a parameter that says for how long a command holds.
+OF_COMMANDS = ('cmd', 'command', 'vel', 'watchdog')
 SET_TIMEOUT = ('set the time-out of the base driver to 0.5 s (diff_drive_controller: '
                'cmd_vel_timeout, velocity_smoother: velocity_timeout, twist_mux: timeout)')
 
@@ -47,6 +49,18 @@ def command(graph: Graph) -> Iterator[Finding]:
     if right and not wrong and not others:
         yield Finding('command', OK, seen.name, f'{", ".join(end.node for end in right)} '
                       f'listen{"s" if len(right) == 1 else ""} to {mine}')
+
+
+def is_command_timeout(name: str) -> bool:
+    """Whether a parameter says for how long a node follows a command.
+
+    As `cmd_vel_timeout`, `velocity_timeout`, and twist_mux's `topics.policy.timeout`; not its
+    `locks.pause.timeout`, whose 0 means that nobody has to repeat it: with a time-out there a
+    silent lock holds the robot for ever. Not of sensors, transforms and bonds either.
+    """
+    *groups, last = name.split('.')
+    return 'locks' not in groups and (last == 'timeout' or 'timeout' in last and any(
+        word in last for word in OF_COMMANDS))
 
 
 def base_timeout(graph: Graph) -> Iterator[Finding]:

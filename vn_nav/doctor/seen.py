@@ -88,6 +88,8 @@ class Middleware:
     profile_exists: bool = True
     domain: str = '0'
     range: str = 'SUBNET'  # of discovery
+    profile_variable: str = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # that this Fast DDS reads
+    ignored_variable: str = ''  # the other one, which is set where that is not
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,7 +82,7 @@ def _cure(graph: Graph, seen: SeenTopic, stream: Stream) -> str:
     own = graph.middleware
     if (stream.bytes > DEFAULT_SEGMENT_BYTES and own.implementation == FAST_DDS
             and not own.profile):
-        return set_profile()
+        return set_profile(own)
     if seen.contract == 'image_raw' and (
             stream.bytes * (stream.count + stream.lost) > LARGE_STREAM_BYTES_PER_S
             * graph.seconds):

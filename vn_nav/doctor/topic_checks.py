@@ -13,6 +13,7 @@ from vn_nav.doctor.seen import (
     Endpoint,
     Finding,
     Graph,
+    Middleware,
     SeenTopic,
 )
 from vn_nav.resources import share_file
@@ -24,10 +25,10 @@ PROPOSED_TOPICS = 3  # that are named as possible replacements, at most
 COMMANDS = ('cmd_vel', 'shadow/cmd_vel')  # checked by `vn_nav.doctor.drive_checks`
 
 
-def set_profile() -> str:
+def set_profile(own: Middleware) -> str:
     """The command that gives this package's Fast DDS profile to a process."""
     profile = share_file('config/fastdds_multihost.xml')
-    return (f'export FASTRTPS_DEFAULT_PROFILES_FILE={profile} in front of policy_node and of the '
+    return (f'export {own.profile_variable}={profile} in front of policy_node and of the '
             'camera driver')
 
 
@@ -36,14 +37,18 @@ def middleware(graph: Graph) -> Iterator[Finding]:
     own, check = graph.middleware, 'middleware'
     if own.profile and not own.profile_exists:
         yield Finding(check, ERROR, '', f'the Fast DDS profile {own.profile} does not exist: the '
-                      'default is used, silently', set_profile())
+                      'default is used, silently', set_profile(own))
+    elif own.implementation == FAST_DDS and own.ignored_variable:
+        yield Finding(check, WARNING, '', f'{own.ignored_variable} is set, which this Fast DDS '
+                      f'does not read: its default is used, silently',
+                      f'export {own.profile_variable}=${own.ignored_variable}')
     elif own.implementation == FAST_DDS and not own.profile:
         image = graph.pictures
         large = 0 if image is None or image.stream is None else image.stream.bytes
         if large > DEFAULT_SEGMENT_BYTES:
             yield Finding(check, WARNING, '', f'no Fast DDS profile is set, and a picture has '
                           f'{large / 1e6:.1f} MB: more than its default shared memory of '
-                          f'{DEFAULT_SEGMENT_BYTES / 1e6:.1f} MB', set_profile())
+                          f'{DEFAULT_SEGMENT_BYTES / 1e6:.1f} MB', set_profile(own))
         else:
             yield Finding(check, OK, '', f'{own.implementation} without a profile, and pictures '
                           'that fit its shared memory')

@@ -28,12 +28,17 @@ def conditions_of(checkpoint: LoadedCheckpoint, *, split: str, houses: int, epis
         stops: what ends the episodes.
         stop_threshold: None: the checkpoint's.
     """
-    planner = hashlib.sha256(b''.join(path.read_bytes() for path in sorted(SEARCH.glob('*.py'))))
-    return {'sha256': checkpoint.info['sha256'], 'planner': planner.hexdigest(), 'split': split,
+    return {'sha256': checkpoint.info['sha256'], 'planner': planner(), 'split': split,
             'houses': houses, 'episodes': episodes, 'seed': seed, 'max_decisions': max_decisions,
             'stops': list(stops),
             'stop_threshold': (checkpoint.info['stop_threshold'] if stop_threshold is None
                                else stop_threshold)}
+
+
+def planner() -> str:
+    """What decides beside a checkpoint's weights: a hash of the planner's code."""
+    return hashlib.sha256(b''.join(
+        path.read_bytes() for path in sorted(SEARCH.glob('*.py')))).hexdigest()
 
 
 def finished(path: Path, wanted: dict) -> dict | None:

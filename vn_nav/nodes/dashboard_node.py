@@ -316,7 +316,7 @@ def main(args=None) -> int:
         import aiohttp  # noqa: F401
     except ModuleNotFoundError as error:
         missing = UserError('the dashboard is served by aiohttp', str(error),
-                            "pip install 'vn_nav[web]', or apt install python3-aiohttp")
+                            'pip install aiohttp, or apt install python3-aiohttp')
         print(f'dashboard_node: {missing}', file=sys.stderr)
         return 2
     return run_node('dashboard_node', lambda _: DashboardNode(), work, args, about=__doc__,

@@ -23,6 +23,7 @@ from rosgraph_msgs.msg import Clock
 
 from vn_msgs_py.topics import BEST_EFFORT, LATCHED, RELIABLE, TOPICS, VOLATILE, topic
 from vn_nav.bags.roles import Topics
+from vn_nav.doctor.drive_checks import is_command_timeout
 from vn_nav.doctor.seen import (
     OUR_DRIVERS,
     BaseStop,
@@ -37,6 +38,7 @@ from vn_nav.errors import UserError
 from vn_nav.nodes import policy_parameters
 from vn_nav.nodes.base_check import try_base
 from vn_nav.nodes.heard import Heard
+from vn_nav.nodes.isolation import NEW_PROFILE, OLD_PROFILE
 from vn_nav.nodes.qos import profile
 from vn_nav.nodes.service_call import ServiceCall
 from vn_nav.nodes.taps import message_class
@@ -224,10 +226,9 @@ class _Doctor:
             values['use_sim_time'])
 
     def _timeouts(self, topics: Mapping[str, SeenTopic]):
-        """Parameters of the nodes that take commands: those whose name speaks of a time-out."""
+        """Parameters of the nodes that take commands: for how long one holds."""
         for node in sorted({end.node for end in topics['cmd_vel'].subscribers}):
-            names = self._list(node)
-            wanted = [name for name in names if 'timeout' in name.rpartition('.')[2]]
+            wanted = filter(is_command_timeout, self._list(node))
             for name, value in self._parameters(node, wanted).items():
                 if isinstance(value, (int, float)) and not isinstance(value, bool):
                     yield node, name, float(value)
@@ -292,8 +293,18 @@ def _value(value) -> Any:
 
 def _middleware() -> Middleware:
     given = os.environ.get
-    # The newer name comes first, as in Fast DDS.
-    file = given('FASTDDS_DEFAULT_PROFILES_FILE') or given('FASTRTPS_DEFAULT_PROFILES_FILE', '')
+    read, other = (OLD_PROFILE, NEW_PROFILE) if _is_fast_dds_2() else (NEW_PROFILE, OLD_PROFILE)
+    file = given(read, '')
     return Middleware(rclpy.get_rmw_implementation_identifier(), file,
                       not file or Path(file).is_file(), given('ROS_DOMAIN_ID') or '0',
-                      given('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET')
+                      given('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'SUBNET', read,
+                      other if given(other) and not file else '')
+
+
+def _is_fast_dds_2() -> bool:
+    """By the library that this process has loaded: its name changed with Fast DDS 3."""
+    try:
+        loaded = Path('/proc/self/maps').read_text()
+    except OSError:
+        return True
+    return '/libfastdds.so' not in loaded

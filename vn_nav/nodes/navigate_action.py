@@ -170,8 +170,11 @@ class NavigateAction:
     def _finish(self, status: Status, code: Code, message: str) -> None:
         """End the goal of the client."""
         handle, self._handle = self._handle, None
+        cancelled = status is Status.CANCELLED and handle.is_cancel_requested  # by the client
         ours = self._navigator.goal.number == self._number
         result = self._kind.Result()
+        if status is not Status.SUCCEEDED and code is Code.NONE and not cancelled:
+            code = Code.STOPPED  # by a person: ~/enable, ~/stop, ~/reset
         result.error_code, result.error_msg = int(code), shorten(message)
         result.arrival = self._output.arrival
         if ours:
@@ -179,7 +182,7 @@ class NavigateAction:
             result.navigation_time = _duration(self._navigator.goal.seconds(time.monotonic()))
         if status is Status.SUCCEEDED:
             handle.succeed()
-        elif status is Status.CANCELLED and handle.is_cancel_requested:
+        elif cancelled:
             handle.canceled()
         else:
             handle.abort()

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from vn_nav.resources import share_file
+from vn_nav.nodes.isolation import profile_environment
 
 
 class ProcessFailure(Exception):
@@ -24,8 +24,7 @@ class Processes:
         self.running: dict[str, subprocess.Popen] = {}
         self.killed: list[str] = []  # children that did not end when they were asked to
         logs.mkdir(parents=True, exist_ok=True)
-        self.environment = os.environ | {
-            'FASTRTPS_DEFAULT_PROFILES_FILE': str(share_file('config/fastdds_localhost.xml')),
+        self.environment = os.environ | profile_environment() | {
             # Others on this host do not meet this robot.
             'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', str(40 + os.getpid() % 60)),
             'OMP_NUM_THREADS': '1', 'PYTHONUNBUFFERED': '1',

@@ -10,13 +10,21 @@ function say(text, good) {
   $('said').classList.toggle('good', Boolean(good));
 }
 
+// While an answer is waited for nothing but a stop can be asked.
+function wait(waits) {
+  document.querySelectorAll('button:not(#stop), #file').forEach((one) => { one.disabled = waits; });
+}
+
 async function ask(address, body) {
+  if (address !== 'stop') wait(true);
   try {
     const answer = await fetch(address, {method: 'POST', body});
     const said = answer.ok ? await answer.json() : {done: false, message: await answer.text()};
     say(said.message, said.done);
   } catch (error) {
     say(`The dashboard does not answer (${error.message}): use the robot's own stop.`);
+  } finally {
+    if (address !== 'stop') wait(false);
   }
 }
 
