@@ -110,6 +110,14 @@ def test_what_the_thesis_says_of_each_experiment():
     assert len(load_experiment('fig5.7').train['scene']) == 16
 
 
+@pytest.mark.parametrize('size, houses', [('quick', 4), ('full', 16)])
+def test_pictures_are_collected_where_is_trained(size, houses, tmp_path):
+    own = reproduction('fig5.7', tmp_path, size)
+    words = own.train_command('A2CAT-VN', 0)
+    trained = [words[k + 1] for k, word in enumerate(words) if word == '--scene']
+    assert len(trained) == houses and own._scenes()[1::2] == trained
+
+
 def test_each_arm_of_the_ablation_has_one_task_more_than_none():
     experiment = load_experiment('ablation')
     parser = build_parser('train')

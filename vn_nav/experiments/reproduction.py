@@ -145,8 +145,8 @@ class Reproduction:
 
     def _scenes(self) -> list[str]:
         """The scenes as options."""
-        return arguments({'scene': list(self.scenes) or self.experiment.train['scene']},
-                         self.values)
+        own = {**self.experiment.train, **self.experiment.sizes[self.size]}
+        return arguments({'scene': list(self.scenes) or own['scene']}, self.values)
 
     def _prepare(self, cores: Sequence[int], say: Callable[[str], None]) -> None:
         """Make the files that are not there, one after the other."""
