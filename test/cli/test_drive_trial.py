@@ -60,7 +60,8 @@ def test_a_job_that_is_free_takes_the_next_leg(tmp_path, monkeypatch):
             assert others_done.wait(30)
 
     monkeypatch.setattr(drive_trial._Driver, '_drive_one', drive_one)
-    driver = drive_trial._Driver(tmp_path, tmp_path, SimpleNamespace(info={'randomisation': 'none'}), tmp_path, {}, {})
+    checkpoint = SimpleNamespace(info={'randomisation': 'none'})
+    driver = drive_trial._Driver(tmp_path, tmp_path, checkpoint, tmp_path, {}, {})
     driver.drive(legs, 2)
     assert sorted(map(len, by_domain.values())) == [1, 5]
 
