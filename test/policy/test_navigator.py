@@ -141,6 +141,18 @@ def test_camera_silence_holds_then_latches(rig):
     rig.arm()
 
 
+def test_a_camera_that_sends_what_is_no_use_is_not_called_silent(rig):
+    rig.arm()
+    for _ in range(30):
+        rig.step()
+        assert not rig.navigator.admit(rig.now - 0.4, rig.now)
+        if rig.navigator.state is State.HOLD:
+            assert 'no usable camera frame: stamps lie 0.40 s behind' in rig.navigator.reason
+    assert rig.navigator.state is State.STOPPED
+    assert rig.navigator.reason.startswith('no usable camera frame for 1.0 s: stamps lie 0.40 s')
+    assert 'max_frame_age' in rig.navigator.reason
+
+
 def test_a_short_silence_heals_by_itself(rig):
     rig.arm()
     for _ in range(8):

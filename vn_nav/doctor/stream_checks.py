@@ -12,6 +12,7 @@ from vn_nav.doctor.topic_checks import DEFAULT_SEGMENT_BYTES, FAST_DDS, set_prof
 MAX_LOST_SHARE = 0.01  # of the pictures: more is a finding
 LARGE_STREAM_BYTES_PER_S = 10e6  # more is compressed before it goes through a network
 # s by which a stamp and a clock differ where one is simulated and the other not: a year
+MOST_OF_LIMIT = 0.7  # of max_frame_age: with more there is no room for load
 ANOTHER_TIME_S = 3e7
 SYNCHRONISE = 'synchronise the clocks of both computers (sudo chronyc makestep)'
 
@@ -161,6 +162,11 @@ def _lag(graph: Graph, seen: SeenTopic, lag: float) -> Iterator[Finding]:
         return
     # Odometry is not judged by its age, but pictures take their poses from it.
     too_old, too_new = lag > limits.max_frame_age, lag < -limits.max_frame_ahead
+    if camera and MOST_OF_LIMIT * limits.max_frame_age < lag <= limits.max_frame_age:
+        yield Finding('clock', WARNING, seen.name, f'{shown}, the limit is '
+                      f'{limits.max_frame_age:g} s: on a busy computer frames are dropped',
+                      f'policy_node --ros-args -p max_frame_age:={_above(lag)}')
+        return
     if not (too_old or too_new):
         yield Finding('clock', OK, seen.name, shown)
         return

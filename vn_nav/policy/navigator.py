@@ -432,12 +432,15 @@ class Navigator:
         """Silence of camera and odometry, and holds whose cause is gone."""
         silence = now - self._heard(now)
         if silence > self.limits.frame_stop_timeout:
-            self.stop(f'no camera frame for {self.limits.frame_stop_timeout} s', now,
-                      Code.CAMERA_LOST)
+            seconds, refused = self.limits.frame_stop_timeout, self.gate.refused
+            self.stop(f'no usable camera frame for {seconds} s: {self.gate.last}' if refused
+                      else f'no camera frame for {seconds} s', now, Code.CAMERA_LOST)
         elif silence > self.limits.frame_timeout:
             if self.state is State.RUNNING:
                 self._abandon()
-            self.state, self.reason = State.HOLD, 'camera silent'
+            self.state, self.reason = State.HOLD, (
+                f'no usable camera frame: {self.gate.last}' if self.gate.refused
+                else 'camera silent')
         elif odometry_lost:
             self._abandon()
             self.state, self.reason = State.HOLD, 'odometry silent'
