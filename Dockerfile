@@ -19,11 +19,13 @@ WORKDIR $WORKSPACE
 # What rosdep knows comes from apt, except what pip has newer below. Before the sources: a change of
 # those does not install it again.
 COPY --chown=robot package.xml src/vn_nav/package.xml
+COPY --chown=robot vn_interfaces/package.xml src/vn_nav/vn_interfaces/package.xml
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3-pip python3-venv \
     && rosdep update --rosdistro jazzy \
-    && rosdep install --from-paths src --ignore-src -y --rosdistro jazzy \
+    && rosdep install --from-paths src src/vn_nav/vn_interfaces --ignore-src -y \
+        --rosdistro jazzy --dependency-types buildtool --dependency-types build \
         --dependency-types exec --skip-keys "python3-gymnasium-pip python3-numba python3-numpy \
         python3-onnxruntime-pip python3-opencv python3-rich python3-rosbags-pip python3-torch" \
     && rm -rf /var/lib/apt/lists/*

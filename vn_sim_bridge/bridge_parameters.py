@@ -21,7 +21,8 @@ PARAMETERS = {
     'noise': (True, 'Gaussian motion noise, which odom does not see'),
     'odometry_drift': (0.0, 'errors of odom: 0 none, 1 as of a good indoor robot, more: worse',
                        (0.0, 1000.0)),
-    'randomisation': ('none', 'of light, camera and base: none, standard, rough, harsh or a YAML file'),
+    'randomisation': ('none', 'of light, camera and base: none, standard, rough, harsh or a YAML '
+                              'file'),
     'goals': ('', 'folder of goal pictures with their poses (goals.json); empty: the own ones'),
     'seed': (0, 'of starts, goals and noise'),
     'time': ('real_time', 'real_time or lock_step (docs/architecture.md, "Time")',

@@ -10,6 +10,7 @@ from vn_nav.dashboard.access import Access
 from vn_nav.dashboard.server import application
 
 REQUESTS = 40  # more than asyncio has threads
+BUSY = 'what was asked before still waits for its answer'
 
 
 class Silent:
@@ -23,39 +24,45 @@ class Silent:
     def ask(self, name):
         """Of the policy."""
         self.asked.append(name)
-        if name != 'stop':
-            assert self.released.wait(60)
+        assert name == 'stop' or self.released.wait(60)
         return True, f'{name}: done'
 
-    def drive_to(self, place):
-        """Along a route."""
-        return self.ask(place)
+    def show_file(self, path):
+        """A goal."""
+        assert self.released.wait(60)
+        return path.name
 
 
-async def press(robot, names):
-    """Press buttons at once, then stop; how long the stop took, and what the others said."""
+async def press(robot, uploads):
+    """Enable where nothing answers, stop, enable; what each of the three said."""
     async with TestClient(TestServer(application(robot, Access('127.0.0.1', '')))) as client:
-        async def said(name):
-            async with client.post(f'/{name}', data='kitchen') as answer:
+        async def said(name, body=b''):
+            async with client.post(f'/{name}', data=body) as answer:
                 return await answer.json()
 
-        others = [asyncio.ensure_future(said(name)) for name in names]
-        while not robot.asked:
-            await asyncio.sleep(0.01)
+        goals = [asyncio.ensure_future(said('goal', b'x')) for _ in range(uploads)]
+        await asyncio.sleep(1.0)  # each has a thread now, or waits for one
+        first = asyncio.ensure_future(said('enable'))
+        await asyncio.sleep(1.0)
+        assert await said('reset') == {'done': False, 'message': BUSY}
         begun = time.monotonic()
-        assert (await said('stop'))['done']
-        waited = time.monotonic() - begun
+        stops = await asyncio.gather(said('stop'), said('stop'))
+        assert all(one['done'] for one in stops) and time.monotonic() - begun < 20
         robot.released.set()
-        return waited, await asyncio.gather(*others)
+        await asyncio.gather(*goals)
+        return await first, await said('enable')
 
 
-def test_a_stop_waits_behind_nothing_and_nothing_comes_after_it():
+def test_a_stop_waits_behind_nothing():
     robot = Silent()
-    waited, others = asyncio.run(press(robot, ['enable', 'reset', 'place'] * (REQUESTS // 3)))
-    assert waited < 20, 'before the others were released'
-    first, last = robot.asked
-    assert last == 'stop', 'what waited is refused, not done later'
-    assert [one['done'] for one in others].count(True) == 1
-    assert {one['message'] for one in others} == {
-        f'{first if first in ("enable", "reset") else "kitchen"}: done',
-        'what was asked before still waits for its answer'}
+    first, after = asyncio.run(press(robot, REQUESTS))
+    assert robot.asked[0] == 'stop', 'every other thread is busy'
+    assert first == {'done': False, 'message': 'a stop came first'}
+    assert after['done'] and robot.asked[-1] == 'enable', 'what is asked later is done'
+    assert robot.asked.count('enable') == 1
+
+
+def test_one_thing_at_a_time_beside_a_stop():
+    robot = Silent()
+    first, after = asyncio.run(press(robot, 0))
+    assert robot.asked[:2] == ['enable', 'stop'] and first['done'] and after['done']

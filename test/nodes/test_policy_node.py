@@ -61,7 +61,7 @@ def test_it_drives_within_limits_and_stops_when_the_camera_falls_silent(
         heard = len(robot.commands)
         robot.spin_for(2.5)
         assert not np.array([v for _, v in robot.commands[heard:]]).any()
-        robot.says('no camera frame')
+        robot.says('no camera frame', 'no usable camera frame')
         assert time.monotonic() - robot.commands[-1][0] > 0.3, 'silence after the latched stop'
         robot.sends.add('image')
         assert '~/reset' in robot.refusal()

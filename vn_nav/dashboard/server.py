@@ -80,6 +80,7 @@ def application(robot: Robot, access: Access, *, camera_rate: float = 5.0) -> we
     """
     server = _Server(robot, access, camera_rate)
     app = web.Application(middlewares=[server.guard], client_max_size=MOST_UPLOAD)
+    app.on_cleanup.append(server.end)
     app.add_routes([
         web.get('/', server.page), web.get('/live', server.live), web.get('/bag', server.bag),
         web.get('/bag/{number}.jpg', server.thumbnail), web.post('/goal', server.upload),
@@ -124,7 +125,9 @@ class _Server:
         self._robot, self._access, self._camera_s = robot, access, 1 / camera_rate
         self._watchers = 0
         # A stop waits behind nothing: its thread does nothing else.
-        self._stops = concurrent.futures.ThreadPoolExecutor(1, 'stop')
+        self._stopper = concurrent.futures.ThreadPoolExecutor(1, 'stop')
+        self._stopping: asyncio.Future | None = None  # the newest stop
+        self._stops = 0  # that were asked for
         self._acting = False  # something else than a stop waits for its answer
 
     @web.middleware
@@ -166,20 +169,32 @@ class _Server:
         name = request.path.lstrip('/')
         if name != 'stop':
             return await self._answer(self._robot.ask, name)
-        done, said = await asyncio.get_running_loop().run_in_executor(
-            self._stops, self._robot.ask, name)
+        self._stops += 1
+        if self._stopping is None or self._stopping.done():  # else it is asked for already
+            self._stopping = asyncio.get_running_loop().run_in_executor(
+                self._stopper, self._robot.ask, name)
+        done, said = await asyncio.shield(self._stopping)
         return web.json_response({'done': done, 'message': said})
 
     async def _answer(self, act: Callable[[str], tuple[bool, str]], what: str) -> web.Response:
-        """What an act of the robot answers; one at a time, so that none comes after a stop."""
+        """What an act of the robot answers; one at a time, and none that waited for a stop."""
         if self._acting:
             return _refused('what was asked before still waits for its answer')
+        stops = self._stops
+
+        def act_first() -> tuple[bool, str]:
+            return act(what) if self._stops == stops else (False, 'a stop came first')
+
         self._acting = True
         try:
-            done, said = await asyncio.to_thread(act, what)
+            done, said = await asyncio.to_thread(act_first)
         finally:
             self._acting = False
         return web.json_response({'done': done, 'message': said})
+
+    async def end(self, _app: web.Application) -> None:
+        """Let go of the thread."""
+        self._stopper.shutdown(wait=False, cancel_futures=True)
 
     async def place(self, request: web.Request) -> web.Response:
         """A place of the route: the body is its name."""

@@ -10,7 +10,7 @@ LONGEST_STOP_S = 1.0  # from the last command to rest, of a base that stops by i
 MIN_TURN_RAD = 0.05  # that a base which hears commands has turned in the trial
 TWIST, STAMPED = 'geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'
 # In the name of a parameter that says for how long a command holds.
-OF_COMMANDS = ('cmd', 'command', 'vel', 'watchdog')
+OF_COMMANDS = ('cmd', 'command', 'vel', 'twist', 'watchdog')
 SET_TIMEOUT = ('set the time-out of the base driver to 0.5 s (diff_drive_controller: '
                'cmd_vel_timeout, velocity_smoother: velocity_timeout, twist_mux: timeout)')
 
@@ -56,7 +56,7 @@ def is_command_timeout(name: str) -> bool:
 
     As `cmd_vel_timeout`, `velocity_timeout`, and twist_mux's `topics.policy.timeout`; not its
     `locks.pause.timeout`, whose 0 means that nobody has to repeat it: with a time-out there a
-    silent lock holds the robot for ever. Not of sensors, transforms and bonds either.
+    silent lock holds the robot for ever. Not `source_timeout`, `transform_timeout` and the like.
     """
     *groups, last = name.split('.')
     return 'locks' not in groups and (last == 'timeout' or 'timeout' in last and any(

@@ -11,8 +11,8 @@ from vn_nav.doctor.topic_checks import DEFAULT_SEGMENT_BYTES, FAST_DDS, set_prof
 
 MAX_LOST_SHARE = 0.01  # of the pictures: more is a finding
 LARGE_STREAM_BYTES_PER_S = 10e6  # more is compressed before it goes through a network
-# s by which a stamp and a clock differ where one is simulated and the other not: a year
 MOST_OF_LIMIT = 0.7  # of max_frame_age: with more there is no room for load
+# s by which a stamp and a clock differ where one is simulated and the other not: a year
 ANOTHER_TIME_S = 3e7
 SYNCHRONISE = 'synchronise the clocks of both computers (sudo chronyc makestep)'
 

@@ -97,6 +97,7 @@ class DashboardNode(Node):
         self._watching: list[Subscription] = []
         self._goals = GoalPublisher(self)
         self._place = self.create_publisher(String, 'route_goal', qos('route_goal'))
+        self._stops = 0  # that were asked for
         self._asked = {name: self.create_client(kind, f'{policy}/{name}')
                        for name, (kind, _) in SERVICES.items()}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_status,
@@ -228,7 +229,11 @@ class DashboardNode(Node):
         kind, fields = SERVICES[name]
         client, until = self._asked[name], time.monotonic() + ANSWER_S
         call = ServiceCall(client, kind.Request(**fields), again=AGAIN_S)
+        self._stops += name == 'stop'
+        stops = self._stops
         while time.monotonic() < until:
+            if name != 'stop' and self._stops != stops:  # it is not asked again after a stop
+                return False, f'{name}: a stop was asked for meanwhile'
             if client.service_is_ready() and call.is_answered():
                 return call.answer.success, call.answer.message or f'{name}: done'
             time.sleep(0.01)

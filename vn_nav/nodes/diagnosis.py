@@ -45,9 +45,9 @@ class Diagnosis:
             fault: why the node is out of action, if it is.
         """
         warnings = [shorten(warning) for warning in warnings[:MAX_WARNINGS]]
-        # Rates in a warning change all the time: it is the same warning.
-        summaries = tuple(re.sub(r'[0-9.]+', '#', warning) for warning in warnings)
-        changed = self._last != (state, reason, fault, *summaries)
+        # Numbers change all the time: it is the same reason, and the same warning.
+        why, *summaries = (re.sub(r'[0-9.]+', '#', text) for text in (reason, *warnings))
+        changed = self._last != (state, why, fault, *summaries)
         if not changed and time.monotonic() - self._published < 0.95:
             return
         if changed and state is State.STOPPED:
@@ -55,7 +55,7 @@ class Diagnosis:
         for warning, short in zip(warnings, summaries, strict=True):
             if self._last is None or short not in self._last:
                 self.node.get_logger().warning(warning, throttle_duration_sec=5.0)
-        self._last, self._published = (state, reason, fault, *summaries), time.monotonic()
+        self._last, self._published = (state, why, fault, *summaries), time.monotonic()
         level, summary = LEVELS.get(state, DiagnosticStatus.OK), state.value
         if reason:
             summary += f' ({reason})' if state is State.ARRIVED else f': {reason}'

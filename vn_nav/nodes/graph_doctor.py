@@ -307,4 +307,4 @@ def _is_fast_dds_2() -> bool:
         loaded = Path('/proc/self/maps').read_text()
     except OSError:
         return True
-    return '/libfastdds.so' not in loaded
+    return '/libfastdds' not in loaded

@@ -89,8 +89,15 @@ class NavigateAction:
         self._server.destroy()
 
     def halt(self, reason: str) -> None:
-        """Abort the goal under way, if any: the node stops acting."""
-        if self._handle is not None:
+        """End the goal under way, if any: the node stops acting."""
+        goal = self._navigator.goal
+        if self._handle is None:
+            return
+        if self._handle.is_cancel_requested:
+            self._finish(Status.CANCELLED, Code.NONE, 'cancelled')
+        elif goal.number == self._number and goal.status in ENDED:  # since `tend` looked
+            self._finish(goal.status, goal.code, goal.message)
+        else:
             self._finish(Status.FAILED, Code.STOPPED, reason)
 
     def _on_goal(self, request) -> GoalResponse:

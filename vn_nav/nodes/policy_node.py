@@ -41,7 +41,7 @@ from vn_nav.robot import RobotSpec, load_robot
 # The watchdog's limits in a shadow: nothing moves, and a busy machine may take its time.
 SHADOW_LIMIT_S = 30.0
 DECISION_END_TIMEOUT_S = 5.0  # for a decision under way when the node ends
-LAST_TURNS = 20  # of the executor, to send what a goal ended with when the process ends
+LAST_TURNS = 50  # of the executor, to send what a goal ended with when the process ends
 
 
 class PolicyNode(LifecycleNode):
@@ -314,8 +314,8 @@ def drive(node: PolicyNode, ended: Ended) -> None:
             if node.is_running:
                 node.trigger_deactivate()
     node.close()
-    with contextlib.suppress(Exception):  # nothing that fails now is of use to anyone
-        for _ in range(LAST_TURNS):
+    for _ in range(LAST_TURNS):
+        with contextlib.suppress(Exception):  # nothing that fails now is of use to anyone
             executor.spin_once(timeout_sec=0.0)
 
 

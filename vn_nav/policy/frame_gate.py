@@ -19,13 +19,12 @@ class FrameGate:
     Attributes:
         dropped: frames that were dropped, by kind: never more than four keys.
         last: why the newest of them was.
-        refused: frames that were dropped since the last one that was admitted.
     """
 
     def __init__(self, max_age: float, max_ahead: float):
         self.max_age, self.max_ahead = max_age, max_ahead
         self.dropped: dict[str, int] = {}
-        self.last, self.refused = '', 0
+        self.last = ''
         self._stamp = -math.inf
 
     def forget(self) -> None:
@@ -59,7 +58,7 @@ class FrameGate:
         elif not stamp > self._stamp:  # also NaN
             self._drop(REORDERED, 'the stamp is not later than the one before')
         else:
-            self._stamp, self.refused = stamp, 0
+            self._stamp = stamp
             return True
         return False
 
@@ -77,7 +76,6 @@ class FrameGate:
     def _drop(self, kind: str, why: str) -> None:
         self.dropped[kind] = self.dropped.get(kind, 0) + 1
         self.last = shorten(why)
-        self.refused += 1
 
 
 def shorten(text: str, most: int = MAX_TEXT_CHARACTERS) -> str:

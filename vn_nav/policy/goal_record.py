@@ -38,7 +38,7 @@ class Code(enum.IntEnum):
     CAMERA_LOST = 10604
     ODOMETRY_LOST = 10605
     GOAL_REFUSED = 10606  # the picture is unusable
-    STOPPED = 10607  # by the watchdog, by another publisher of commands, with the node
+    STOPPED = 10607  # by the watchdog, another publisher of commands, a person, with the node
     NOT_READY = 10608  # an action goal: motion could not be enabled
 
 

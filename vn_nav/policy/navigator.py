@@ -111,6 +111,7 @@ class Navigator:
         self._rolls_until = -np.inf  # stamp
         self._healthy_since: float | None = None
         self._last_frame: float | None = None  # steady time at which the newest good frame came
+        self._refused = -np.inf  # steady time at which the newest frame was dropped
         self._admitted = -np.inf  # steady time at which the newest admitted one came
         self._thought = -np.inf  # steady time at which the newest decision was made
         self._look_after = -np.inf  # stamp that the next decision's frame must exceed
@@ -140,6 +141,8 @@ class Navigator:
             self.time_jumped(f'camera stamps went back by {back:.4g} s')
         if admitted := self.gate.admit(stamp, clock):
             self._admitted = max(self._admitted, now)
+        else:
+            self._refused = max(now, self._now)
         return admitted
 
     def time_jumped(self, reason: str) -> None:
@@ -163,7 +166,7 @@ class Navigator:
     def bad_frame(self, reason: str, now: float) -> None:
         """An admitted frame could not be decoded. Three in a row stop the robot."""
         self.gate.unusable(reason)
-        self._admitted = -np.inf
+        self._admitted, self._refused = -np.inf, now
         self._bad_frames += 1
         self._healthy_since = None
         if self._bad_frames >= 3 and self.state in ENABLED:
@@ -431,16 +434,16 @@ class Navigator:
     def _watch(self, now: float, odometry_lost: bool) -> None:
         """Silence of camera and odometry, and holds whose cause is gone."""
         silence = now - self._heard(now)
+        drops = now - self._refused <= self.limits.frame_timeout  # what comes is of no use
         if silence > self.limits.frame_stop_timeout:
-            seconds, refused = self.limits.frame_stop_timeout, self.gate.refused
-            self.stop(f'no usable camera frame for {seconds} s: {self.gate.last}' if refused
+            seconds = self.limits.frame_stop_timeout
+            self.stop(f'no usable camera frame for {seconds} s: {self.gate.last}' if drops
                       else f'no camera frame for {seconds} s', now, Code.CAMERA_LOST)
         elif silence > self.limits.frame_timeout:
             if self.state is State.RUNNING:
                 self._abandon()
             self.state, self.reason = State.HOLD, (
-                f'no usable camera frame: {self.gate.last}' if self.gate.refused
-                else 'camera silent')
+                f'no usable camera frame: {self.gate.last}' if drops else 'camera silent')
         elif odometry_lost:
             self._abandon()
             self.state, self.reason = State.HOLD, 'odometry silent'

@@ -213,8 +213,8 @@ def load_randomisation(name: str | Path) -> Randomisation:
     if re.fullmatch('[a-z_0-9]+', str(name)) and not path.exists():
         path = share_file(f'config/randomisation/{name}.yaml')
     if not path.is_file():
-        raise UserError("a randomisation is 'none', 'standard', 'rough' or a YAML file", str(name),
-                        'see config/randomisation/ for examples')
+        raise UserError("a randomisation is 'none', 'standard', 'rough', 'harsh' or a YAML file",
+                        str(name), 'see config/randomisation/ for examples')
     data = read_yaml(path, 'a randomisation file', 'see config/randomisation/ for examples')
     known = {field.name for field in dataclasses.fields(Randomisation)}
     if unknown := sorted(set(map(str, data)) - known):

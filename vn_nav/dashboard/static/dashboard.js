@@ -3,7 +3,8 @@ const $ = (name) => document.getElementById(name);
 const KINDS = {1: 'camera', 2: 'goal', 3: 'map'};
 const LEVELS = ['ok', 'warn', 'error', 'error'];
 const OLD_MS = 3000;  // without word from the server
-let heard = 0, curve = [], ofGoal = null, bag = null, received = [], places = '';
+const ANSWER_MS = 8000;  // for an answer; the server itself waits 3 s for the policy
+let waiting = 0, heard = 0, curve = [], ofGoal = null, bag = null, received = [], places = '';
 
 function say(text, good) {
   $('said').textContent = text;
@@ -11,20 +12,25 @@ function say(text, good) {
 }
 
 // While an answer is waited for nothing but a stop can be asked.
-function wait(waits) {
-  document.querySelectorAll('button:not(#stop), #file').forEach((one) => { one.disabled = waits; });
+function wait(more) {
+  waiting += more;
+  document.querySelectorAll('button:not(#stop), #file').forEach(
+    (one) => { one.disabled = waiting > 0; });
 }
 
 async function ask(address, body) {
-  if (address !== 'stop') wait(true);
+  const stops = address === 'stop';
+  if (!stops && waiting) return;
+  if (!stops) { $('stop').focus(); wait(1); }  // a disabled button would keep the space bar
   try {
-    const answer = await fetch(address, {method: 'POST', body});
+    const signal = address === 'goal' ? undefined : AbortSignal.timeout(ANSWER_MS);
+    const answer = await fetch(address, {method: 'POST', body, signal});
     const said = answer.ok ? await answer.json() : {done: false, message: await answer.text()};
     say(said.message, said.done);
   } catch (error) {
     say(`The dashboard does not answer (${error.message}): use the robot's own stop.`);
   } finally {
-    if (address !== 'stop') wait(false);
+    if (!stops) wait(-1);
   }
 }
 
@@ -88,6 +94,7 @@ function tellRoute(route) {
     $('places').replaceChildren(...names.length ? names.map((name) => {
       const button = document.createElement('button');
       button.textContent = name;
+      button.disabled = waiting > 0;
       button.addEventListener('click', () => ask('place', name));
       return button;
     }) : [none]);
@@ -128,6 +135,7 @@ function watch() {
 }
 
 function choose(number) {
+  if (waiting) return;
   document.querySelectorAll('.chosen').forEach((node) => node.classList.remove('chosen'));
   $('pictures').children[number].classList.add('chosen');
   $('pictures').children[number].scrollIntoView({block: 'nearest'});
