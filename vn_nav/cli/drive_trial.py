@@ -194,7 +194,7 @@ def _parameters(pairs: Sequence[str]) -> dict[str, Any]:
 
 
 def _legs(bases: Sequence[str], scenes: Sequence[str], episodes: int) -> list[Leg]:
-    """A scene's episodes on every base before the next scene: an interrupted trial compares."""
+    """A scene's episodes on every base; of an interrupted trial the first scenes compare."""
     shares = [episodes // len(scenes) + (k < episodes % len(scenes)) for k in range(len(scenes))]
     return [Leg(base, scene, SEED + k, count)
             for k, (scene, count) in enumerate(zip(scenes, shares, strict=True)) if count
@@ -229,9 +229,10 @@ class _Driver:
                 if finished(self._out / f'{leg.name}.json', self._wanted(leg)) is None]
         ended = threading.Event()
         domains = [40 + (os.getpid() + job) % 60 for job in range(jobs)]
-        # One queue: a leg in real time takes many times as long as one in lock-step.
+        # One queue: a leg in real time takes many times as long as one in lock-step. Those first:
+        # they take all of a core, and beside them pictures in real time come too late.
         waiting = queue.SimpleQueue[Leg]()
-        for leg in left:
+        for leg in sorted(left, key=lambda leg: BASES[leg.base].bridge['time'] != 'lock_step'):
             waiting.put(leg)
         with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
             running = [pool.submit(self._drive_several, waiting, domain, ended)
