@@ -171,6 +171,26 @@ def test_another_export_takes_the_place_of_the_first(tmp_path):
     assert PolicyRuntime(folder).search is None
 
 
+def test_an_export_in_its_folder_computes_a_checkpoint_while_it_is_of_that_state(tmp_path):
+    from vn_nav.cli import main
+    folder = tmp_path / 'checkpoint'
+    network = learned('fused')
+    save_checkpoint(folder, network, INFO)
+    assert PolicyRuntime(folder).engine.startswith(f'PyTorch ({folder}')
+    assert main(['export', str(folder)]) == 0
+    assert PolicyRuntime(folder).engine == f'ONNX Runtime ({folder / "onnx"})'
+    assert load_checkpoint(folder).network.state_dict().keys() == network.state_dict().keys()
+    save_checkpoint(folder, network, INFO | {'stop_threshold': 0.8})  # the card says another one
+    stale = PolicyRuntime(folder)
+    assert stale.engine.startswith('PyTorch') and stale.stop_threshold == 0.8
+    assert main(['export', str(folder)]) == 0
+    assert PolicyRuntime(folder).engine.startswith('ONNX Runtime')
+    with torch.no_grad():
+        next(network.parameters()).add_(0.1)
+    save_checkpoint(folder, network, INFO | {'stop_threshold': 0.8})  # other weights
+    assert PolicyRuntime(folder).engine.startswith('PyTorch')
+
+
 DRIVE = """
 import numpy as np
 from vn_nav.policy.runtime import PolicyRuntime

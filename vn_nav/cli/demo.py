@@ -31,6 +31,7 @@ from vn_nav.evaluation.metrics import Episode, bootstrap_interval, summarise
 from vn_nav.nodes.isolation import stay_on_this_host
 from vn_nav.nodes.processes import Processes, ProcessFailure
 from vn_nav.policy.checkpoint import LoadedCheckpoint
+from vn_nav.policy.checkpoint_info import TRIAL
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.report.demo_page import kind_of, write_report
 from vn_nav.report.tables import TITLES, number
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from vn_nav.nodes.demo_watch import EndedEpisode
 
 ONE_HOUSE, ANY_HOUSE = 'models/house', 'models/search'  # the shipped policies
-TRIAL = 'trial.json'  # beside the second: what `vn_nav drive-trial --keep` wrote of it
 LIMIT, UNSEEN_LIMIT = 300, 100  # decisions an episode; the second for a policy of one house
 UNSEEN_HOUSE = 11_000  # seed, of the split test: no shipped policy has seen it
 SEED = 2026  # of starts, goals and light

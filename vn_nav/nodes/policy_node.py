@@ -111,6 +111,7 @@ class PolicyNode(LifecycleNode):
                                 stop_threshold=None if threshold < 0 else threshold,
                                 verify=value['verify'], camera_pitch=robot.camera_pitch,
                                 keep_map=value['keep_map'])
+        self.get_logger().info(f'computed by {runtime.engine}')
         robot = robot.with_actions(runtime.action_names, runtime.moves)
         runtime.forbid(robot.impossible)
         if robot.impossible:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from vn_nav.errors import UserError
-from vn_nav.policy.checkpoint_info import ONNX_FILES
+from vn_nav.policy.checkpoint_info import (
+    CONFIG,
+    EXPORT,
+    ONNX_FILES,
+    PLACE_CHECKSUM,
+    WEIGHTS,
+    read_config,
+)
 from vn_nav.policy.network_config import NetworkConfig
 from vn_nav.policy.search.eyes import Eyes
 
@@ -26,11 +34,13 @@ class Backend(Protocol):
 
     Attributes:
         config: of the network; info: what else the checkpoint says.
+        engine: what computes it, for people.
         eyes: of a policy that searches; None: it is another.
     """
 
     config: NetworkConfig
     info: dict
+    engine: str
     eyes: Eyes | None
 
     def encode_goal(self, goal: np.ndarray) -> np.ndarray:
@@ -62,7 +72,7 @@ class Backend(Protocol):
 
 
 def load_backend(folder: Path, seed: int) -> Backend:
-    """A checkpoint by PyTorch; an export by ONNX Runtime.
+    """An export by ONNX Runtime, which is faster, also one in a checkpoint's folder; else PyTorch.
 
     Args:
         folder: of either; seed: of the sampled actions.
@@ -71,9 +81,11 @@ def load_backend(folder: Path, seed: int) -> Backend:
         UserError: see `vn_nav.policy.checkpoint.load_checkpoint` and `vn_nav.policy.onnx_backend`;
             what has to compute it is not installed.
     """
-    if any((folder / name).is_file() for name in ONNX_FILES):
+    export = folder if any((folder / name).is_file() for name in ONNX_FILES) else (
+        own_export(folder) if importlib.util.find_spec('onnxruntime') else None)
+    if export is not None:
         from vn_nav.policy.onnx_backend import OnnxBackend
-        return OnnxBackend(folder, seed)
+        return OnnxBackend(export, seed)
     try:
         from vn_nav.policy.torch_backend import TorchBackend
     except ImportError as error:
@@ -83,3 +95,19 @@ def load_backend(folder: Path, seed: int) -> Backend:
                         'pip install torch; or run `vn_nav export` where it is installed, and '
                         'pass that folder') from error
     return TorchBackend(folder, seed)
+
+
+def own_export(folder: Path) -> Path | None:
+    """The export in a checkpoint's folder; None: there is none, or of another state of it.
+
+    Raises:
+        UserError: see `read_config`.
+    """
+    export = folder / EXPORT
+    if not (export / CONFIG).is_file():
+        return None
+    (own, info), (other, others) = (read_config(folder, (WEIGHTS,)),
+                                    read_config(export, ONNX_FILES))
+    same = info == others and all(own.get(key) == other.get(key)
+                                  for key in ('sha256', PLACE_CHECKSUM))
+    return export if same else None

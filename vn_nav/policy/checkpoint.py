@@ -25,9 +25,11 @@ from vn_nav.policy.checkpoint_info import (
     CARD,
     CHECKSUM,
     CONFIG,
+    EXPORT,
     FORMAT,
     PLACE,
     PLACE_CHECKSUM,
+    TRIAL,
     WEIGHTS,
     check_info,
     config_checksum,
@@ -212,7 +214,8 @@ def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
     """Write a folder that appears, or is replaced, whole or not at all."""
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    if folder.exists() and any(path.name not in (WEIGHTS, CONFIG, CARD, PLACE)
+    # What was made of the checkpoint before goes with it: an export, a trial.
+    if folder.exists() and any(path.name not in (WEIGHTS, CONFIG, CARD, PLACE, EXPORT, TRIAL)
                                for path in folder.iterdir()):
         raise UserError('only a checkpoint folder is replaced by a checkpoint', str(folder),
                         'choose another folder')

@@ -15,6 +15,8 @@ from vn_nav.structured_file import read_json
 
 SEARCH = 'search'  # the architecture of `vn_nav.policy.search`
 WEIGHTS, CONFIG, CARD = 'model.safetensors', 'config.json', 'README.md'
+EXPORT = 'onnx'  # folder in that of a checkpoint: `vn_nav export`, unless it is told another
+TRIAL = 'trial.json'  # in it, too: what `vn_nav drive-trial --keep` wrote
 POLICY, GOAL, SEE, COMPARE = ONNX_FILES = 'policy.onnx', 'goal.onnx', 'see.onnx', 'compare.onnx'
 PLACE = 'place.safetensors'  # of a policy that searches, where it was taught a place
 FORMAT = 2

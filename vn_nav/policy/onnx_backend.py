@@ -48,6 +48,7 @@ class OnnxBackend:
         config, info = read_config(folder, ONNX_FILES)
         self.config = read_network(config, str(folder / CONFIG))
         self.info = {**info, 'sha256': config['sha256']}
+        self.engine = f'ONNX Runtime ({folder})'
         self._random = np.random.default_rng(seed)
         self.eyes: Eyes | None = None
         if self.config.architecture == SEARCH:

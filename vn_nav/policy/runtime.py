@@ -50,6 +50,7 @@ class PolicyRuntime:
         filter_counts: how often it acted, since this object was made.
         camera_fov: field of view that the pictures have [rad].
         info: what else the checkpoint says.
+        engine: what computes it, for people.
         stop_threshold: the one in force; None: the policy declares nothing.
         arrival: probability that the robot has arrived, by the head `arrival`, at the picture
             that `act` saw last; nan before it, and where the network has no such head.
@@ -81,6 +82,7 @@ class PolicyRuntime:
         self.moves: tuple[tuple[float, float, float], ...] = config.moves
         self.camera_fov: float = math.radians(info['camera_fov_deg'])
         self.info: dict = info
+        self.engine: str = backend.engine
         self._goal_maps: np.ndarray | None = None
         self.action_filter: str = config.filter_name
         self.filter_counts = FilterCounts()

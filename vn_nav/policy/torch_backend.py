@@ -29,6 +29,7 @@ class TorchBackend:
 
     def __init__(self, folder: Path, seed: int):
         checkpoint = load_checkpoint(folder)
+        self.engine = f'PyTorch ({folder}; ONNX Runtime is faster: vn_nav export {folder})'
         torch.set_num_threads(1)
         self.config, self.info, self._network = (
             checkpoint.config, checkpoint.info, checkpoint.network)
