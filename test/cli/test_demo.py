@@ -16,6 +16,7 @@ from vn_nav.cli.demo import ANY_HOUSE, ONE_HOUSE, SEED, control_env
 from vn_nav.cli.world import make_env
 from vn_nav.evaluation.bag_episodes import drives_from_bag
 from vn_nav.policy.checkpoint import load_checkpoint
+from vn_nav.report.trial_page import SHOWN
 from vn_nav.resources import share_file
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(240)]  # drives over ROS
@@ -110,7 +111,8 @@ def test_the_recorder_has_each_house_from_its_first_picture(demo):
 
 def test_the_page_is_whole_and_needs_nothing_else(demo):
     page = (demo / 'report.html').read_text()
-    assert page.count('<svg') == 2 and page.count('data:image/png') > 10
+    assert page.count('<svg') == 2 + SHOWN, 'a map of each house, and ways of the trial'
+    assert 'On a base that is late and slips' in page and page.count('data:image/png') > 10
     assert '<script' not in page and 'src="http' not in page and '<link' not in page
     assert 'nan' not in re.sub(r'data:[^"]*', '', page)
 

@@ -91,22 +91,23 @@ def section(trial: dict) -> str:
         trial: of `kept`.
     """
     result, shown = trial['result'], []
-    for scene in trial['scenes']:
-        if 'bounds' not in scene['plan']:
-            continue
-        for one in scene['drives'][:max(SHOWN // len(trial['scenes']), 1)]:
-            way = np.array(one['way'])
-            drawn = floor_map(scene['plan'], [Journey(way, one['success'])], [one['goal']])
-            colour = 'yes' if one['success'] else 'no'
-            shown.append(f'<figure>{drawn}<figcaption>{html.escape(scene["plan"]["scene"])}: '
-                         f'<span class="{colour}">{one["outcome"]}</span> after '
-                         f'{one["decisions"]} decisions, {one["seconds"]} s</figcaption></figure>')
+    # The first drive of each scene, the second, and so on; shown scene by scene.
+    drives = sorted(((turn, number, one) for number, scene in enumerate(trial['scenes'])
+                     if 'bounds' in scene['plan'] for turn, one in enumerate(scene['drives'])),
+                    key=lambda entry: entry[:2])[:SHOWN]
+    for _, scene_number, one in sorted(drives, key=lambda entry: entry[1::-1]):
+        plan, way = trial['scenes'][scene_number]['plan'], np.array(one['way'])
+        drawn = floor_map(plan, [Journey(way, one['success'])], [one['goal']])
+        colour = 'yes' if one['success'] else 'no'
+        shown.append(f'<figure>{drawn}<figcaption>{html.escape(plan["scene"])}: '
+                     f'<span class="{colour}">{one["outcome"]}</span> after '
+                     f'{one["decisions"]} decisions, {one["seconds"]} s</figcaption></figure>')
     return f"""<h2>On a base that is late and slips</h2>
 <p class="soft">Not of this run: <code>vn_nav drive-trial</code> drove these, {result['date']},
 {html.escape(result['machine'])}, in houses that no training saw. The harsh base
 {html.escape(trial['about']['harsh'])}</p>
 {_compared(result['bases'])}{_difference(result)}
-<div class="maps">{''.join(shown[:SHOWN])}</div>"""
+<div class="maps">{''.join(shown)}</div>"""
 
 
 def _difference(result: dict) -> str:
