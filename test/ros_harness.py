@@ -59,6 +59,11 @@ def child(module, log, *, rules=(), **parameters):
             process.wait()
 
 
+# Limits of a node beside others that start up: for tests that are not about its watchdog.
+PATIENT = {'inference_timeout': 2.0, 'frame_timeout': 3.0, 'frame_stop_timeout': 10.0,
+           'max_frame_age': 3.0, 'odometry_timeout': 5.0}
+
+
 def wait_until(condition, spin, seconds=PATIENCE, what=''):
     """Call `spin` until the condition holds; the seconds it took.
 

@@ -14,7 +14,7 @@ import pytest
 import rclpy
 from fake_robot import RELIABLE, FakeRobot
 from paths import ROOT, TESTS
-from ros_harness import child, wait_until, write_checkpoint
+from ros_harness import PATIENT, child, wait_until, write_checkpoint
 from std_srvs.srv import SetBool, Trigger
 
 from vn_nav.policy.goal_record import Code
@@ -24,9 +24,6 @@ ACTION = PACKAGE / 'action' / 'NavigateToImage.action'
 TREE = ROOT / 'config' / 'behavior_trees' / 'navigate_to_image.xml'
 CODES = range(10600, 10700)  # outside of what Nav2 keeps for itself; a hundred for each server
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6  # action_msgs/GoalStatus
-# Of a node beside a client that starts up: nothing here is about its watchdog.
-PATIENT = {'inference_timeout': 2.0, 'frame_timeout': 3.0, 'frame_stop_timeout': 10.0,
-           'max_frame_age': 3.0, 'odometry_timeout': 5.0}
 
 
 @pytest.fixture(scope='module')

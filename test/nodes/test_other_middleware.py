@@ -8,12 +8,10 @@ from pathlib import Path
 
 import pytest
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from ros_harness import child, write_checkpoint
+from ros_harness import PATIENT, child, write_checkpoint
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 PATIENCE = 150  # s
-LIMITS = {'inference_timeout': 2.0, 'frame_timeout': 3.0, 'frame_stop_timeout': 10.0,
-          'max_frame_age': 3.0, 'odometry_timeout': 5.0}  # of a loaded machine
 LISTEN = """
 import os, sys, time
 import rclpy
@@ -62,7 +60,7 @@ def test_a_picture_becomes_a_command(middleware, tmp_path, monkeypatch):
     with router(middleware), \
             child('vn_sim_bridge.bridge_node', tmp_path / 'bridge', house=7), \
             child('vn_nav.nodes.policy_node', tmp_path / 'policy', auto_enable=True,
-                  checkpoint=checkpoint, **LIMITS):
+                  checkpoint=checkpoint, **PATIENT):
         heard = python(LISTEN.format(patience=PATIENCE))
     assert heard.stdout.split() == [middleware, 'True'], heard.stdout + heard.stderr + (
         tmp_path / 'policy').read_text()

@@ -252,8 +252,7 @@ class _Driver:
         varied = base.bridge.get('randomisation', self._info['randomisation'])
         return self._conditions | dataclasses.asdict(leg) | {
             'bridge': base.bridge, 'policy': base.policy | parameters,
-            'randomisation': json.loads(json.dumps(dataclasses.asdict(
-                load_randomisation(varied))))}
+            'randomisation': dataclasses.asdict(load_randomisation(varied))}
 
     def _drive_several(self, waiting: queue.SimpleQueue[Leg], domain: int,
                        ended: threading.Event) -> None:

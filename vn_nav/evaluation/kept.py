@@ -47,6 +47,7 @@ def finished(path: Path, wanted: dict) -> dict | None:
         found = json.loads(path.read_text())
     except (FileNotFoundError, ValueError):  # no JSON, or no text
         return None
+    wanted = json.loads(json.dumps(wanted))  # a tuple is a list there
     return found if isinstance(found, dict) and found.get('conditions') == wanted else None
 
 
