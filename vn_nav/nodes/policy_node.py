@@ -111,12 +111,8 @@ class PolicyNode(LifecycleNode):
                                 stop_threshold=None if threshold < 0 else threshold,
                                 verify=value['verify'], camera_pitch=robot.camera_pitch,
                                 keep_map=value['keep_map'])
-        self.get_logger().info(f'computed by {runtime.engine}')
         robot = robot.with_actions(runtime.action_names, runtime.moves)
         runtime.forbid(robot.impossible)
-        if robot.impossible:
-            names = ', '.join(robot.action_names[k] for k in robot.impossible)
-            self.get_logger().info(f'{robot.name} is a differential base: never {names}')
         source.check_policy(searches=runtime.search is not None)
         shadow = value['mode'] == 'shadow'
         if self.lock_step:
@@ -150,6 +146,11 @@ class PolicyNode(LifecycleNode):
                                     compressed=compressed, lock_step=self.lock_step,
                                     shadow=shadow, ranges=self._ranges)
         self._make_interfaces()
+        # Only now: a configuration that fails says one line, which is why.
+        self.get_logger().info(f'computed by {runtime.engine}')
+        if robot.impossible:
+            names = ', '.join(robot.action_names[k] for k in robot.impossible)
+            self.get_logger().info(f'{robot.name} is a differential base: never {names}')
 
     def _make_interfaces(self) -> None:
         self._operation = Operation(
