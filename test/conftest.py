@@ -94,3 +94,11 @@ def source_copy(tmp_path):
         shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(
             '.venv', 'runs', 'demo', 'build', 'install', 'log', '*.egg-info', '__pycache__', '.*'))
     return copy
+
+
+@pytest.fixture(autouse=True)
+def nothing_said(monkeypatch):
+    """Notes are written once in a process: each test is told anew."""
+    from vn_sim_bridge import notices
+    monkeypatch.setattr(notices, '_SAID', set())
+    monkeypatch.setattr(notices, '_KINDS', notices.Counter())

@@ -12,11 +12,6 @@ from vn_sim_bridge.meshes.vocabulary import Vocabulary
 from vn_sim_bridge.render.mesh_scene import Surface, mesh_scene
 
 
-@pytest.fixture(autouse=True)
-def nothing_said(monkeypatch):
-    monkeypatch.setattr(notices, '_SAID', set())
-
-
 def plain(**material):
     file = Gltf()
     file.node(file.square(material=file.material(factor=(1, 1, 1), **material)))
@@ -60,6 +55,15 @@ def test_what_is_left_out_of_obj_is_said_once(tmp_path, capsys, line, said):
                                       'f 1 2 3\n')
     load_mesh(tmp_path / 'a b.obj', default_label='wall')
     assert len(capsys.readouterr().err.splitlines()) == said
+
+
+def test_of_many_places_the_first_notes_are_written(tmp_path, capsys):
+    for number in range(12):
+        load_mesh(plain(alphaMode='BLEND').write(tmp_path / f'{number}.glb'))
+    load_mesh(plain(emissiveFactor=[1.0, 0.5, 0.0]).write(tmp_path / 'lamp.glb'))
+    *said, other = capsys.readouterr().err.splitlines()
+    assert len(said) == notices.MOST and 'emissive' in other
+    assert ['left out)' in line for line in said] == [False] * (notices.MOST - 1) + [True]
 
 
 def test_a_file_that_loses_nothing_says_nothing(tmp_path, capsys):
