@@ -8,8 +8,8 @@ Parts: `render` (agreement with the Numba renderer, rendering and environment ra
 one house, their curves and checkpoints) and `export` (what the GPU-trained weights say on the CPU
 and in ONNX Runtime). Where a command may take ten minutes only, `--parts render`, `--parts train`
 and `--parts learn export` fit into one each. `--parts reproduce` runs the thesis's experiments at
-full size (docs/reproduce.md), and goes on where it was interrupted; `--experiments`, `--frames`
-and `--limit-minutes` say how much.
+full size (docs/reproduce.md), as long as it takes, and goes on where it was interrupted;
+`--experiments`, `--frames` and `--limit-minutes` say how much.
 
 Prints one JSON line a figure, with the hardware's name. Every part and preset is a process of its
 own: one that fails or takes too long leaves a line with its error, and the rest goes on. `--device
@@ -17,9 +17,13 @@ cpu` runs the same kernels slowly, to try the script.
 """
 
 import argparse
+import contextlib
 import gc
 import json
+import math
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -38,6 +42,7 @@ PRESETS = ('a2c', 'unreal', 'thesis', 'fast')
 LEARNED = ('fast', 'thesis')
 ROUNDS = 7
 WARM_UP = 2  # updates
+PATIENCE = 90.0  # s that trainings may take to save and end
 HOUSE, ROOMS, MAX_DECISIONS = 3, 2, 300  # of the table of presets (bench/learning.py)
 FACTS = {'camera_fov_deg': 90.0, 'camera_height': 1.0}
 
@@ -49,7 +54,8 @@ def parse():
     parser.add_argument('--out', type=Path, help='also append the lines here')
     parser.add_argument('--parts', nargs='+', choices=(*PARTS, REPRODUCE),
                         default=list(PARTS))
-    parser.add_argument('--limit-minutes', type=float, default=60.0, help='for everything')
+    parser.add_argument('--limit-minutes', type=float, help='for everything (default: 60, or with '
+                        f'{REPRODUCE} no limit)')
     parser.add_argument('--envs', type=int, nargs='+', default=[64, 256, 1024, 4096, 16384],
                         help='of render')
     parser.add_argument('--sizes', type=int, nargs='+', default=[84, 174], help='of render')
@@ -69,7 +75,10 @@ def parse():
     parser.add_argument('--curves', type=Path, default=Path('bench/gpu/curves'),
                         help='folder for the curves and checkpoints of learn')
     parser.add_argument('--job', help=argparse.SUPPRESS)  # what a child process does
-    return parser.parse_args()
+    arguments = parser.parse_args()
+    if arguments.limit_minutes is None:
+        arguments.limit_minutes = math.inf if REPRODUCE in arguments.parts else 60.0
+    return arguments
 
 
 def jobs(arguments) -> list[str]:
@@ -359,6 +368,36 @@ def reproduce(arguments, name: str):
     say(arguments, f'reproduced: {name}', None, '', f'figures in {results}')
 
 
+def run_job(command: list[str], limit: float) -> None:
+    """One job; at the limit, or when somebody ends this one, all that it has started ends first.
+
+    Raises:
+        subprocess.SubprocessError: it failed, or took too long.
+    """
+    with subprocess.Popen(command, start_new_session=True) as process:
+        try:
+            code = process.wait(None if math.isinf(limit) else limit)
+        except BaseException:
+            end_group(process)
+            raise
+    if code:
+        raise subprocess.CalledProcessError(code, command)
+
+
+def end_group(process: subprocess.Popen) -> None:
+    """Ask a process and its group to save and end; kill those that do not."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        deadline = time.monotonic() + PATIENCE
+        with contextlib.suppress(ProcessLookupError):  # none is left
+            os.killpg(process.pid, number)
+            while time.monotonic() < deadline:
+                process.poll()
+                os.killpg(process.pid, 0)
+                time.sleep(0.1)
+            continue
+        break
+
+
 def main():
     """Run the jobs as children, each within what is left of the time."""
     arguments = parse()
@@ -368,14 +407,14 @@ def main():
                 REPRODUCE: reproduce}[part]
         work(arguments, *([name] if name else []))
         return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     begun, failed = time.monotonic(), 0
     for job in jobs(arguments):
         left = 60 * arguments.limit_minutes - (time.monotonic() - begun)
         try:
             if left <= 0:
                 raise TimeoutError('no time is left')
-            command = [sys.executable, __file__, *sys.argv[1:], '--job', job]
-            subprocess.run(command, check=True, timeout=left)
+            run_job([sys.executable, __file__, *sys.argv[1:], '--job', job], left)
         except (subprocess.SubprocessError, TimeoutError) as error:
             failed += 1
             say(arguments, job, None, '', f'limit {arguments.limit_minutes:g} minutes',

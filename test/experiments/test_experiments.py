@@ -31,6 +31,7 @@ from vn_nav.report.experiment_page import spread, write_results
 from vn_nav.report.page import CURVES
 from vn_nav.robot import load_robot
 
+CURVES_OF_THE_DOCS = Path(__file__).parents[2] / 'docs' / 'curves' / 'reproduce'
 SMALL = """
 title: small
 question: does it run
@@ -174,10 +175,13 @@ def test_an_experiment_runs_from_files_to_page_and_is_not_repeated(tmp_path, cap
     # In so few frames no mean is of 200 episodes: nothing is said to be reached.
     assert own['seeds'] == [0, 1]
     assert own['reached'] == {'1000': [None, None], '1': [None, None]}
-    assert set(result['controls']) == {'random actions', 'shortest path', 'blank goal'}
+    assert set(result['controls']) == {'random actions', 'shortest path', 'LSTM: blank goal',
+                                       'Frame stack: blank goal'}
     assert result['controls']['shortest path']['decisions'] <= 12
     page, table = (kept / 'page.html').read_text(), (kept / 'table.md').read_text()
-    assert 'not within' in page and 'vn_nav train' in page and str(tmp_path) not in table
+    for text in ('not held by', 'vn_nav train', 'vn_nav evaluate'):
+        assert text in page
+    assert str(tmp_path) not in table
     assert (kept / 'curves.png').stat().st_size > 5000
 
     # On another machine, with only what stayed: nothing is run again; a missing run is.
@@ -193,7 +197,8 @@ def test_an_experiment_runs_from_files_to_page_and_is_not_repeated(tmp_path, cap
 
 
 @pytest.mark.slow
-def test_a_stopped_experiment_stops_its_runs_and_goes_on(tmp_path):
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_a_stopped_experiment_stops_its_runs_and_goes_on(number, tmp_path):
     path = small(tmp_path, SMALL.replace('frames: 1300', 'frames: 20_000'))
     command = [sys.executable, '-m', 'vn_nav.cli', 'reproduce', str(path), '--out',
                str(tmp_path / 'runs'), '--seeds', '0', '--arms', 'LSTM']
@@ -204,7 +209,7 @@ def test_a_stopped_experiment_stops_its_runs_and_goes_on(tmp_path):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.2)
     time.sleep(1.0)
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(number)
     process.communicate(timeout=90)
     log = state.parent.with_suffix('.log')
     assert not _alive(str(state.parent)) and 'evaluate' not in log.read_text()
@@ -263,15 +268,53 @@ def test_what_was_run_with_other_options_is_not_taken_for_a_run(tmp_path):
     arm = next(iter(own.experiment.arms))
     kept = own.kept / own.run_name(arm, 0)
     kept.mkdir(parents=True)
-    (kept / 'evaluation.json').write_text(json.dumps({'options': own.options(arm) | {'size': 7}}))
-    with pytest.raises(UserError, match='size: 7'):
-        own.run([0], print)
+    for said, rule in (({'options': own.options(arm) | {'size': 7}}, 'size: 7'),
+                       ({}, 'says what options')):
+        (kept / 'evaluation.json').write_text(json.dumps(said))
+        with pytest.raises(UserError, match=rule):
+            own.run([0], print)
     (kept / 'evaluation.json').unlink()
     begun = own.out / own.folder / own.run_name(arm, 0)
     begun.mkdir(parents=True)
     (begun / 'options.json').write_text(json.dumps(own.options(arm) | {'frames': 3}))
     with pytest.raises(UserError, match='frames: 3'):
         own.run([0], print)
+
+
+def test_the_runs_that_ship_are_those_of_the_experiments():
+    """What the page of the results shows was run with the options of the files of today."""
+    for name in experiment_names():
+        own = Reproduction(load_experiment(name), 'quick', Path('runs'), CURVES_OF_THE_DOCS)
+        for path in own.kept.glob('*/evaluation.json'):
+            found = json.loads(path.read_text())
+            own._check(found['arm'], found['options'], path.parent)
+            assert path.parent.name == own.run_name(found['arm'], found['seed'])
+
+
+def test_a_short_try_has_folders_of_its_own(tmp_path):
+    whole, tried = (reproduction(small(tmp_path), tmp_path, frames=frames)
+                    for frames in (None, 700))
+    assert tried.folder == 'small-quick-700' and tried.options('LSTM')['frames'] == 700
+    assert whole.folder == 'small-quick' != tried.kept.name
+
+
+def test_files_are_made_again_by_another_command(tmp_path, monkeypatch):
+    made = []
+
+    def run(jobs, cores, say):
+        for job in jobs:
+            made.append(job.commands[0])
+            job.after()
+    monkeypatch.setattr('vn_nav.experiments.jobs.run', run)
+    for text in (SMALL, SMALL, SMALL.replace('--rooms 1', '--rooms 2'), SMALL):
+        reproduction(small(tmp_path, text), tmp_path)._prepare([0], print)
+    assert [command[5] for command in made] == ['1', '2', '1']
+
+
+def test_each_arm_is_shown_other_goals(tmp_path):
+    own = reproduction(small(tmp_path), tmp_path, seeds=(0, 1))
+    assert [[('--no-controls' in own.evaluate_command(arm, seed)) for seed in own.seeds]
+            for arm in own.experiment.arms] == [[False, True]] * 2
 
 
 def test_runs_that_stay_in_the_curriculum_are_measured_there(tmp_path):

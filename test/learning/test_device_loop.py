@@ -5,6 +5,8 @@ import copy
 import math
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -306,7 +308,7 @@ def test_what_the_device_lacks_is_said(capsys, monkeypatch):
     assert main(words) == 2
     assert 'nvidia-smi' in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, 'warp', None)
-    assert main(words) == 2
+    assert main([*words, '--set', 'imitation=0', '--set', 'teacher_share=0']) == 2
     assert 'vn_nav[gpu]' in capsys.readouterr().err
 
 
@@ -322,3 +324,24 @@ def test_the_gpu_script_trains_and_writes_a_curve(tmp_path):
     assert '"error"' not in text, text
     assert 'training on the device, thesis' in text
     assert (tmp_path / 'curves' / 'thesis' / 'metrics.csv').read_text().count('\n') > 1
+
+
+def test_a_job_of_the_gpu_script_that_takes_too_long_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / 'bench' / 'gpu')
+    import run
+    ended, script = tmp_path / 'ended', tmp_path / 'child.py'
+    script.write_text(f"""
+import pathlib, signal, sys, time
+def end(*_):
+    pathlib.Path({str(ended)!r}).write_text('saved')
+    sys.exit()
+signal.signal(signal.SIGTERM, end)
+time.sleep(600)
+""")
+    begun = time.monotonic()
+    with pytest.raises(subprocess.TimeoutExpired):
+        run.run_job([sys.executable, '-c', 'import subprocess, sys\n'
+                     f'subprocess.run([sys.executable, {str(script)!r}])'], 4.0)
+    assert ended.read_text() == 'saved' and time.monotonic() - begun < 60
+    with pytest.raises(subprocess.CalledProcessError):
+        run.run_job([sys.executable, '-c', 'raise SystemExit(3)'], math.inf)

@@ -10,7 +10,7 @@ from two_bars import TwoBars
 
 from vn_nav.errors import UserError
 from vn_nav.learning.presets import TrainConfig, preset
-from vn_nav.learning.state_file import read_state
+from vn_nav.learning.state_file import own_folder, read_state
 from vn_nav.learning.trainer import train
 from vn_nav.learning.training import STATE
 from vn_nav.policy.checkpoint import load_checkpoint
@@ -64,6 +64,16 @@ def test_a_training_resumes_and_refuses_what_does_not_fit(tmp_path):
     state.write_bytes(state.read_bytes()[:-1] + b'x')
     with pytest.raises(UserError, match='SHA-256'):
         train(make_env(), more, tmp_path / 'run', info=FACTS, resume=True)
+
+
+def test_a_folder_has_one_training_at_a_time(tmp_path):
+    folder = tmp_path / 'run'
+    with own_folder(folder), pytest.raises(UserError, match='another process'):
+        train(TwoBars(6), QUICK, folder, info=FACTS)
+    assert not folder.exists()
+    train(TwoBars(6), QUICK, folder, info=FACTS)
+    with own_folder(folder), pytest.raises(UserError, match='another process'):
+        train(TwoBars(6), QUICK, folder, info=FACTS, resume=True)
 
 
 def test_another_order_of_actions_is_refused(tmp_path):

@@ -17,7 +17,7 @@ A2C = {'frames': 20_000, 'rollout_length': 5, 'learning_rate': 1e-3, 'hidden': 1
        'replay_steps': 2000, 'replay_length': LIMIT + 1}
 BUDGETS: dict[str, dict] = {
     'a2c': A2C, 'unreal': A2C, 'framestack': A2C, 'thesis': A2C,
-    'icra2017': {'frames': 20_000, 'learning_rate': 1e-2, 'hidden': 128},
+    'icra2017': {'frames': 20_000, 'hidden': 128},
     # By reinforcement alone: a teacher would give the answer away.
     'fast': {'frames': 8000, 'imitation': 0.0, 'teacher_share': 0.0, 'pair_minutes': 0.0},
     # Turns are all that is decided here: there is no way to reckon.

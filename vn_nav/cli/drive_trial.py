@@ -10,7 +10,6 @@ import json
 import os
 import queue
 import shutil
-import signal
 import threading
 import time
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vn_nav.cli import demo
+from vn_nav.cli.interruption import ended_as_by_ctrl_c
 from vn_nav.errors import UserError
 from vn_nav.resources import share_file
 
@@ -135,11 +135,8 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     legs = _legs(args.bases, scenes, args.episodes)
     driver = _Driver(args.out, Path(folder), checkpoint, robot, wanted, extra)
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    with ended_as_by_ctrl_c():
         driver.drive(legs, args.jobs)
-    finally:
-        signal.signal(signal.SIGTERM, before)
     result = driver.figures(legs) | {
         'checkpoint': str(args.checkpoint or demo.ANY_HOUSE), 'robot': robot.name,
         'max_decisions': args.max_decisions, 'parameters': extra, 'machine': machine(),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 from pathlib import Path
 
+from vn_nav.cli.interruption import ended_as_by_ctrl_c
 from vn_nav.experiments.experiment import experiment_names
 
 
@@ -54,8 +54,7 @@ def run(args: argparse.Namespace) -> int:
         seeds=args.seeds, arms=args.arms, scenes=args.scene, device=args.device,
         frames=int(args.frames) if args.frames else None, machine=machine(args.device))
         for name in args.names]
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # runs save and end, then
-    try:
+    with ended_as_by_ctrl_c():  # runs save and end, then
         for own in wanted:
             if not args.page:
                 own.run(cores[:args.jobs], SAY)
@@ -63,6 +62,4 @@ def run(args: argparse.Namespace) -> int:
                 raise UserError('a page is of runs that have ended', str(own.kept),
                                 'run the experiment without --page')
             print(own.kept / 'page.html')
-    finally:
-        signal.signal(signal.SIGTERM, before)
     return 0

@@ -44,7 +44,7 @@ NUMBERS = {
     'pair_houses': (int, 'draw pairs from the first so many scenes of the split train'),
     'bag_share': (float, 'with --bags: steps of drives for each step of a rollout'),
     'threads': (int, 'of torch and of the renderer'),
-    'device': (str, 'where network and simulator run: cpu, or a GPU such as cuda:0'),
+    'device': (str, 'where the network runs, and robots if they can: cpu, or a GPU (cuda:0)'),
 }
 CHANGES = (*NUMBERS, 'channels', 'curriculum', 'bf16', 'overlap')
 # Options of the environment, whose defaults are the preset's.
@@ -185,7 +185,7 @@ def run(args: argparse.Namespace) -> int:
                    goal_variants=args.goal_variants, **MOTION_NOISE[args.motion_noise],
                    privileged=tuple(sorted(set(config.privileged) & set(PRIVILEGED))), **world)
     config, words = config_without(config, env.config.privileged, env.simulator_name,
-                                   always=ALWAYS if _has_goals(env, config.device) else ())
+                                   always=ALWAYS if _has_goals(env) else ())
     for line in words:
         print(line, flush=True)
     bags = _bag_mix(args, config, env.robot)
@@ -202,10 +202,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _has_goals(env, device: str) -> bool:
+def _has_goals(env) -> bool:
     """Whether arriving somewhere is what an environment is about, as in houses on any device."""
-    return device != 'cpu' or bool(
-        env.distance_unit and not env.simulator.capabilities.rewards)
+    simulator = getattr(env, 'simulator', None)  # `WarpNavigationEnv` is all of one
+    return simulator is None or bool(env.distance_unit and not simulator.capabilities.rewards)
 
 
 def _info(args: argparse.Namespace, config, env, bags) -> dict:

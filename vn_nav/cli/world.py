@@ -54,7 +54,8 @@ def make_env(scenes, envs: int, *, robot: Path | RobotSpec | None = None, thread
              say: Callable[[str], None] = SAY, **options):
     """A `NavigationEnv` of some scenes; without a robot file with the scenes' own robot.
 
-    On a device other than the CPU it is a `WarpNavigationEnv`.
+    On a device other than the CPU it is a `WarpNavigationEnv` if that can simulate what is asked
+    for; else a line says why robots are simulated on the CPU, beside a network on the device.
 
     Args:
         may_lack: options of `env_config.OPTIONAL` that are left out, with a line, in a simulator
@@ -65,6 +66,7 @@ def make_env(scenes, envs: int, *, robot: Path | RobotSpec | None = None, thread
     from vn_sim_bridge.navigation.env_config import (
         EnvConfig,
         check_simulator,
+        not_on_device,
         setup_for,
         with_own_actions,
         without_the_unknown,
@@ -76,25 +78,29 @@ def make_env(scenes, envs: int, *, robot: Path | RobotSpec | None = None, thread
     config = EnvConfig(scenes=tuple(scenes), num_envs=envs, randomisation=randomisation,
                        **options)
     spec = robot_for(config.scenes, _loaded(robot))
-    if device == 'cpu':
-        if may_lack is None:
-            return NavigationEnv(config, spec, threads=threads)
-        config = with_own_actions(config, spec)
-        own = spec.with_actions(config.actions)
-        simulator = open_simulator(config.scenes, setup_for(config, own, threads))
-        try:
-            config, words = without_the_unknown(config, simulator, may_lack)
-            check_simulator(simulator, config, own)
-            env = NavigationEnv(config, spec, simulator=simulator)
-        except BaseException:
-            simulator.close()
-            raise
-        for line in words:
-            say(line)
-        return env
-    _check_gpu(device)
-    from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
-    return WarpNavigationEnv(config, spec, device=device)
+    if device != 'cpu':
+        refusal = not_on_device(config)
+        _check_gpu(device, simulates=refusal is None)
+        if refusal is None:
+            from vn_sim_bridge.navigation.warp_env import WarpNavigationEnv
+            return WarpNavigationEnv(config, spec, device=device)
+        say(f'Robots are simulated on the CPU, and the network is on {device}: {refusal.rule} '
+            f'(here: {refusal.received})')
+    if may_lack is None:
+        return NavigationEnv(config, spec, threads=threads)
+    config = with_own_actions(config, spec)
+    own = spec.with_actions(config.actions)
+    simulator = open_simulator(config.scenes, setup_for(config, own, threads))
+    try:
+        config, words = without_the_unknown(config, simulator, may_lack)
+        check_simulator(simulator, config, own)
+        env = NavigationEnv(config, spec, simulator=simulator)
+    except BaseException:
+        simulator.close()
+        raise
+    for line in words:
+        say(line)
+    return env
 
 
 def _loaded(robot: Path | RobotSpec | None) -> RobotSpec | None:
@@ -156,20 +162,21 @@ def make_env_for(checkpoint, scenes, envs: int, *, stop: str, own: bool,
     return env
 
 
-def _check_gpu(device: str) -> None:
-    """Whether the simulator can run on a GPU such as cuda:0."""
+def _check_gpu(device: str, simulates: bool) -> None:
+    """Whether a GPU such as cuda:0 is there for the network and, where it simulates, for Warp."""
     import torch
-    try:
-        import warp as wp
-    except ImportError as error:
-        raise UserError('the simulator runs on a GPU with the extra "gpu"', str(error),
-                        "pip install 'vn_nav[gpu]', or use --device cpu") from error
-    number = torch.device(device).index or 0
-    known = min(torch.cuda.device_count(), wp.get_cuda_device_count())
-    if number >= known:
-        raise UserError('the device is a GPU that torch and Warp find', f'{device}; they find '
-                        f'{known or "none"}', 'look at nvidia-smi and at torch.version.cuda, or '
-                        'use --device cpu')
+    known = torch.cuda.device_count()
+    if simulates:
+        try:
+            import warp as wp
+        except ImportError as error:
+            raise UserError('the simulator runs on a GPU with the extra "gpu"', str(error),
+                            "pip install 'vn_nav[gpu]', or use --device cpu") from error
+        known = min(known, wp.get_cuda_device_count())
+    if (torch.device(device).index or 0) >= known:
+        who = 'torch and Warp find' if simulates else 'torch finds'
+        raise UserError(f'the device is a GPU that {who}', f'{device}; found: {known or "none"}',
+                        'look at nvidia-smi and at torch.version.cuda, or use --device cpu')
 
 
 def machine(device: str = 'cpu') -> str:

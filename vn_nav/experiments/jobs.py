@@ -20,12 +20,16 @@ PATIENCE = 60.0  # s that a command which was asked to stop may take to save
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """Commands of `vn_nav`, one after the other; `after` is called when all have succeeded."""
+    """Commands of `vn_nav`, one after the other; `before` is called first, `after` at the end.
+
+    At the end: when all have succeeded.
+    """
 
     name: str
     commands: Sequence[Sequence[str]]
     log: Path
-    after: Callable[[], None] = lambda: None
+    after: Callable[[], object] = lambda: None
+    before: Callable[[], object] = lambda: None
 
 
 @dataclasses.dataclass
@@ -71,6 +75,7 @@ def run(jobs: Sequence[Job], cores: Sequence[int], say: Callable[[str], None]) -
                 if core not in running and waiting:
                     job = waiting.pop(0)
                     say(f'{job.name}: begins on core {core}')
+                    job.before()
                     running[core] = _Running(job, _start(job, 0, core))
             time.sleep(POLL)
     finally:

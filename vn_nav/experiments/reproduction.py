@@ -1,7 +1,8 @@
 """Runs an experiment: files, trainings with several seeds, measurements; keeps what stays.
 
 `OUT/NAME-SIZE/` gets the runs and `RESULTS/NAME-SIZE/` what stays of them: a folder for each run
-with its thinned curve and its measurement, the chart, the table and the page. A run whose
+with its thinned curve and its measurement, the chart, the table and the page (`NAME-SIZE-FRAMES`
+where somebody tries it with fewer frames). A run whose
 measurement is among the results is not repeated, on any machine; one that was interrupted goes on.
 """
 
@@ -12,6 +13,7 @@ import datetime
 import functools
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +22,7 @@ from vn_nav.errors import UserError
 from vn_nav.experiments import jobs
 from vn_nav.experiments.experiment import Experiment, arguments, filled, slug
 from vn_nav.files import write_file
-from vn_nav.report.curves import METRICS, thin
+from vn_nav.report.curves import thin
 from vn_nav.resources import share_file
 
 EVALUATION = 'evaluation.json'
@@ -68,7 +70,8 @@ class Reproduction:
     @property
     def folder(self) -> str:
         """Of this experiment in `out` and `results`."""
-        return f'{self.experiment.name}-{self.size}'
+        tried = '' if self.frames is None else f'-{self.frames}'
+        return f'{self.experiment.name}-{self.size}{tried}'
 
     @property
     def kept(self) -> Path:
@@ -88,15 +91,17 @@ class Reproduction:
         """Whether what is there was run with the options of now.
 
         Args:
-            options: it was run with; None: nobody knows.
+            options: it was run with; None: it does not say so.
 
         Raises:
             UserError: it was not.
         """
         wanted = self.options(arm)
-        if options is None or options == wanted:
+        if options == wanted:
             return
-        assert isinstance(options, dict)
+        if not isinstance(options, dict):
+            raise UserError('a run says what options it had', str(folder),
+                            'remove it, or choose another folder')
         others = [f'{key}: {options.get(key)}, now {wanted.get(key)}'
                   for key in {**options, **wanted} if options.get(key) != wanted.get(key)]
         raise UserError('runs of an experiment have the same options',
@@ -154,16 +159,18 @@ class Reproduction:
         log = self.out / self.folder / 'prepare.log'
         for step in self.experiment.prepare:
             target = Path(filled(step.makes, self.values))
-            done = target.with_name(target.name + '.done')
-            if done.exists():
-                continue
-            if target.is_dir():  # half of it, from a command that was interrupted
-                shutil.rmtree(target)
+            done = target.with_name(target.name + '.done')  # by which command
             command = [word for part in step.command.split()
                        for word in (self._scenes() if part == SCENES
                                     else [filled(part, self.values)])]
-            jobs.run([jobs.Job(f'{self.folder}: {target.name}', [command], log, done.touch)],
-                     cores[:1], say)
+            text = shlex.join(command) + '\n'
+            if done.exists() and done.read_text() == text:
+                continue
+            done.unlink(missing_ok=True)
+            if target.is_dir():  # half of it, or by another command
+                shutil.rmtree(target)
+            jobs.run([jobs.Job(f'{self.folder}: {target.name}', [command], log,
+                               functools.partial(done.write_text, text))], cores[:1], say)
 
     def train_command(self, arm: str, seed: int, resume: bool = False) -> list[str]:
         """`vn_nav train` of one run, from its beginning or with the run that is there."""
@@ -177,38 +184,40 @@ class Reproduction:
                 '--no-tensorboard', '--out', str(folder), *(['--resume'] if resume else [])]
 
     def evaluate_command(self, arm: str, seed: int) -> list[str]:
-        """`vn_nav evaluate` of one run; the controls are measured with the first arm and seed."""
+        """`vn_nav evaluate` of one run; the controls are measured with the first of each arm."""
         folder = self.out / self.folder / self.run_name(arm, seed)
-        first = arm == next(iter(self.experiment.arms)) and seed == self.seeds[0]
         options = {key: value for key, value in self.experiment.options(arm, self.size).items()
                    if key in ('robot', 'max_decisions')} | dict(self.experiment.evaluate)
         if (difficulty := self._difficulty(arm)) < 1.0:
             options['difficulty'] = difficulty
+        controls = [] if seed == self.seeds[0] else ['--no-controls']
         return ['evaluate', str(folder / 'checkpoint'), '--stop', 'arrival',
-                *arguments(options, self.values), *([] if first else ['--no-controls']),
-                '--json', str(folder / EVALUATION)]
+                *arguments(options, self.values), *controls, '--json', str(folder / EVALUATION)]
 
     def _job(self, arm: str, seed: int) -> jobs.Job:
         """Training and measurement of one run."""
+        from vn_nav.learning.training import STATE
         name = self.run_name(arm, seed)
         folder = self.out / self.folder / name
-        begun = folder / OPTIONS
-        if begun.exists():
-            self._check(arm, json.loads(begun.read_text()), folder)
-        else:
+        if (folder / OPTIONS).exists():
+            self._check(arm, json.loads((folder / OPTIONS).read_text()), folder)
+
+        def begin() -> None:
             folder.mkdir(parents=True, exist_ok=True)
-            write_file(begun, (json.dumps(self.options(arm), indent=1) + '\n').encode())
+            write_file(folder / OPTIONS, (json.dumps(self.options(arm), indent=1) + '\n').encode())
 
         def keep() -> None:
             thin(folder, self.kept / name)
             found = json.loads((folder / EVALUATION).read_text())
-            found |= {'arm': arm, 'seed': seed, 'machine': self.machine,
+            found |= {'arm': arm, 'seed': seed, 'evaluation_seed': found['seed'],
+                      'machine': self.machine,
                       'options': self.options(arm), 'difficulty': self._difficulty(arm),
                       'date': datetime.date.today().isoformat(),
-                      'command': ['vn_nav', *self.train_command(arm, seed)]}
+                      'command': ['vn_nav', *self.train_command(arm, seed)],
+                      'evaluate_command': ['vn_nav', *self.evaluate_command(arm, seed)]}
             text = json.dumps(found, indent=1).replace(f'{Path.cwd()}{os.sep}', '')
             write_file(self.kept / name / EVALUATION, (text + '\n').encode())
         return jobs.Job(f'{self.folder}: {name}',
-                        [self.train_command(arm, seed, resume=(folder / METRICS).exists()),
+                        [self.train_command(arm, seed, resume=(folder / STATE).exists()),
                          self.evaluate_command(arm, seed)],
-                        folder.with_suffix('.log'), keep)
+                        folder.with_suffix('.log'), keep, begin)

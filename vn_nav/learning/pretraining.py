@@ -24,7 +24,7 @@ from vn_nav.files import write_file
 from vn_nav.learning.hindsight import Drives, Split, draw_windows, partners, rows_of
 from vn_nav.learning.log import METRICS
 from vn_nav.learning.pretrain_config import PretrainConfig
-from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
+from vn_nav.learning.state_file import own_folder, read_state, remove_partial, write_state, written
 from vn_nav.learning.supervised import FIGURES, PARTS, Batch, Objective, Tally
 from vn_nav.policy.checkpoint import save_checkpoint
 from vn_nav.policy.network import Policy
@@ -66,7 +66,9 @@ def pretrain_network(network: Policy, drives: Drives, parts: Sequence[str], spli
         UserError: a folder or resumption that does not fit, a loss that is not finite, or a full
             disk.
     """
-    return _Pretraining(network, drives, parts, split, folder, config, info).run(resume, on_epoch)
+    with own_folder(Path(folder)):
+        return _Pretraining(network, drives, parts, split, folder, config, info).run(
+            resume, on_epoch)
 
 
 class _Pretraining:

@@ -25,7 +25,7 @@ from vn_nav.learning.augmentation import augment
 from vn_nav.learning.log import METRICS
 from vn_nav.learning.sight_figures import FIGURES, Judged, figures, judge
 from vn_nav.learning.sight_losses import WEIGHTS, losses
-from vn_nav.learning.state_file import read_state, remove_partial, write_state, written
+from vn_nav.learning.state_file import own_folder, read_state, remove_partial, write_state, written
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
 from vn_nav.policy.network_config import SEARCH
 from vn_nav.policy.search.look import column_bearings
@@ -106,7 +106,8 @@ def train_sight(network: SearchPolicy, source: ViewSource, validation: ViewSourc
         KeyboardInterrupt: see on_step.
     """
     training = _Training(network, source, validation, Path(folder), config, info)
-    return training.run(resume, init, say, on_step, page)
+    with own_folder(training.folder):
+        return training.run(resume, init, say, on_step, page)
 
 
 class _Training:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import io
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,6 +44,32 @@ def written(path: Path) -> Iterator[None]:
                         f'{error.filename or path}: {error.strerror}',
                         'free some space, or allow it to write there, and resume: the last saved '
                         'state is whole') from error
+
+
+@contextlib.contextmanager
+def own_folder(folder: Path) -> Iterator[None]:
+    """Make a folder, and keep other trainings out of it; an empty one is removed at the end.
+
+    Raises:
+        UserError: another process trains there, or it cannot be made.
+    """
+    with written(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UserError('one training at a time writes into a folder',
+                            f'{folder}, where another process does', 'wait for it, end it, or '
+                            'choose another folder') from error
+        except OSError:
+            pass  # a file system without locks
+        yield
+    finally:
+        os.close(descriptor)  # which ends the lock, as the end of this process does
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def remove_partial(folder: Path) -> None:

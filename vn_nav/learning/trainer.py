@@ -16,6 +16,7 @@ from vn_nav.learning.distributed import Processes
 from vn_nav.learning.log import Log
 from vn_nav.learning.pairs import PairSource
 from vn_nav.learning.presets import TrainConfig
+from vn_nav.learning.state_file import own_folder
 from vn_nav.learning.training import CHECKPOINT, Training
 from vn_nav.vector_env import NavigationVectorEnv
 
@@ -56,12 +57,13 @@ def train(env: NavigationVectorEnv, config: TrainConfig, folder: str | Path, *,
         The folder of the final checkpoint.
 
     Raises:
-        UserError: a folder or resumption that does not fit, a full disk, or a loss that is not
-            finite; the last save stays as it is.
+        UserError: a folder or resumption that does not fit, or where another process trains, a
+            full disk, or a loss that is not finite; the last save stays as it is.
         EnvironmentLost: what was learned until then has been saved.
     """
     folder = Path(folder)
-    with Processes.join(config.pair_minutes) as processes:
+    with Processes.join(config.pair_minutes) as processes, (
+            own_folder(folder) if processes.leads else contextlib.nullcontext()):
         training = Training(env, config, folder, info, processes, bags)
         training.start(resume, init, pairs)
         lost: EnvironmentLost | None = None

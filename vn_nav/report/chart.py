@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -59,7 +59,7 @@ Shape = Line | Text
 
 def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, title: str,
           y_range: tuple[float, float], log: bool, marks: Sequence[float] = (),
-          labels: Sequence[str] = ()) -> list[Shape]:
+          levels: Mapping[str, float] | None = None, labels: Sequence[str] = ()) -> list[Shape]:
     """Axes and curves.
 
     Args:
@@ -69,6 +69,7 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
         y_range: lowest and highest value shown.
         log: logarithmic x.
         marks: values to draw a dashed line at.
+        levels: values to draw a line at, by the name that is written there.
         labels: below x = 0, 1, 2, ... in place of numbers.
     """
     left, top, right, bottom = box
@@ -100,6 +101,9 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
                for y in marks if y0 < y < y1]
     shapes += [Line(np.array([[left, bottom], [right, bottom]]), 'soft'),
                Text((left + right) / 2, bottom + 40, title, 'middle', 'ink', 13)]
+    for name, y in (levels or {}).items():
+        shapes += [Line(np.array([[left, up(y)], [right, up(y)]]), 'ink', 1.2),
+                   Text(right - 4, up(y) - 5, name, 'end', 'ink', 11)]
     for s in series:
         along = np.array([across(value) for value in s.x])
         outline = np.concatenate([np.stack([along, up(s.high)], 1),

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from vn_nav import __version__
 from vn_nav.errors import UserError
@@ -65,23 +64,23 @@ def compare(paths: Sequence[Path], out: Path, *, metric: str = 'success',
 
 
 def chart(groups: dict[str, list[Run]], metric: str, band: str = 'range', log: bool = False,
-          levels: Mapping[str, float] | None = None) -> tuple[list[Shape], float]:
+          levels: Mapping[str, float] | None = None, axes: Sequence[str] = tuple(AXES)
+          ) -> tuple[list[Shape], float]:
     """Curves against frames and wall-clock, and the height of the chart [pixels]; `WIDTH` wide.
 
     Args:
         groups: runs by label.
         metric, band, log: see `compare`.
         levels: names and values of horizontal lines.
+        axes: both, or one of them across the whole chart.
     """
     levels = levels or {}
-    flat = [(label, f'c{k}' if k < CURVES else 'ink')  # one colour for what the curves left none
-            for k, label in enumerate(levels, start=len(groups))]
     names = [(f'{label} ({len(runs)} run{"s" * (len(runs) > 1)})', f'c{k}')
              for k, (label, runs) in enumerate(groups.items())]
-    shapes, used = legend([*names, *flat], PANELS[0][0], 12, WIDTH - 16)
-    top = 12 + used + 14
+    shapes, used = legend(names, PANELS[0][0], 12, WIDTH - 16)
+    top = 12 + used + 22
     curves = {axis: [average(runs, axis, metric, band=band, log=log) for runs in groups.values()]
-              for axis in AXES}
+              for axis in axes}
     if metric in SHARES:
         y_range = 0.0, 1.0
     else:
@@ -91,16 +90,13 @@ def chart(groups: dict[str, list[Run]], metric: str, band: str = 'range', log: b
                    *levels.values())
         edge = 0.05 * (high - low) or 1.0
         y_range = low - edge, high + edge
-    for (axis, own), (left, right) in zip(curves.items(), PANELS, strict=True):
+    boxes = PANELS if len(axes) > 1 else ((PANELS[0][0], PANELS[-1][1]),)
+    for (axis, own), (left, right) in zip(curves.items(), boxes, strict=True):
         series = [Series(name, colour, c.x, c.mean, c.low, c.high, c.full)
                   for (name, colour), c in zip(names, own, strict=True)]
-        ends = np.array([min(c.x[0] for c in own) if log else 0.0, max(c.x[-1] for c in own)])
-        for (name, colour), value in zip(flat, levels.values(), strict=True):
-            line = np.full(2, value)
-            series.append(Series(name, colour, ends, line, line, line, np.ones(2, bool)))
         shapes += panel((left, top, right, top + PLOT), series,
                         title=f'{metric} over {AXES[axis]}', y_range=y_range, log=log,
-                        marks=THRESHOLDS if metric == 'success' else ())
+                        marks=THRESHOLDS if metric == 'success' else (), levels=levels)
     return shapes, top + PLOT + 56
 
 

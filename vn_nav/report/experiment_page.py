@@ -20,12 +20,12 @@ from vn_nav.files import write_file
 from vn_nav.report import tables
 from vn_nav.report.chart import to_picture, to_svg
 from vn_nav.report.compare import WIDTH, chart
-from vn_nav.report.curves import HOLD_SHARE, Run, grouped, reached, read_runs
+from vn_nav.report.curves import HOLD_SHARE, THRESHOLDS, Run, grouped, reached, read_runs
 from vn_nav.report.page import page, table
 from vn_nav.report.terminal import print_table
 
-CONTROLS = (RANDOM, SHORTEST)  # in the chart
-IN_TABLE = (*CONTROLS, WRONG, BLANK)
+CONTROLS = (RANDOM, SHORTEST)  # in the chart; the same for all arms
+OTHER_GOALS = (WRONG, BLANK)  # of an arm
 # Figures of the measurements in the table: heading, key, format.
 FIGURES = (('success', 'success', '.2f'), ('SPL', 'spl', '.2f'), ('decisions', 'decisions', '.0f'),
            ('return', 'return', '.2f'), ('collisions', 'collisions', '.1%'))
@@ -54,27 +54,32 @@ def write_results(experiment: Experiment, size: str, folder: Path) -> dict[str, 
     key = MEASURED.get(experiment.metric, experiment.metric)
     levels = {name: controls[name][key] for name in CONTROLS
               if controls.get(name, {}).get(key) is not None}
+    machines = sorted({own['machine'] for own in found})
     result: dict[str, Any] = {
         'experiment': experiment.name, 'size': size,
-        'machines': sorted({own['machine'] for own in found}),
+        'machines': machines,
         'dates': sorted({own['date'] for own in found}),
         'arms': {arm: _figures(experiment, own, [m for m in found if m['arm'] == arm])
                  for arm, own in groups.items()},
         'controls': {name: {key: own.get(key) for _, key, _ in FIGURES}
                      for name, own in controls.items()}}
     headings, lines = _cells(experiment, result)
-    shapes, height = chart(groups, experiment.metric, levels=levels)
+    # Minutes of several machines do not make one axis.
+    shapes, height = chart(groups, experiment.metric, levels=levels,
+                           axes=('frames', 'minutes')[:1 if len(machines) > 1 else 2])
     image = cv2.cvtColor(to_picture(shapes, WIDTH, height), cv2.COLOR_RGB2BGR)
     markdown = tables.markdown([headings, ['---'] * len(headings), *lines])
     svg = to_svg(shapes, WIDTH, height, experiment.title)
-    commands = '\n'.join(shlex.join(own['command']) for own in found)
+    commands = '\n'.join(shlex.join(command) for own in found
+                         for command in (own['command'], own.get('evaluate_command')) if command)
     body = f"""<h1>{html.escape(experiment.title)}</h1>
 <p>{html.escape(experiment.question)}</p>
 <p><b>The thesis:</b> {html.escape(experiment.claim)}</p>
 <figure>{svg}</figure>
 <p class="soft">{html.escape(experiment.metric)}: the trainer's mean over its last 200 episodes.
 Lines are means over seeds, bands go from the least to the greatest, and both end where the
-shortest of these runs ends. Dashed: inside the curriculum. Horizontal: measured controls.</p>
+shortest of these runs ends. Dashed curves: inside the curriculum, whose episodes start nearer to
+the goal. Lines with a name: measured controls.{_marks(experiment)}</p>
 {table(headings, [[html.escape(cell) for cell in line] for line in lines])}
 <p class="soft">Frames to a value: where the mean over the following tenth of the run holds it.
 The other columns are measured after the training, {_starts(found)}, actions sampled; means over
@@ -89,6 +94,12 @@ seeds, in brackets the least and the greatest.</p>
         write_file(folder / name, data)
     print_table(f'{experiment.name}, {size}', headings, lines)
     return result
+
+
+def _marks(experiment: Experiment) -> str:
+    """What the dashed lines of the chart are, in words."""
+    return (f' Dashed lines: {" and ".join(f"{value:g}" for value in THRESHOLDS)}.'
+            if experiment.metric == 'success' else '')
 
 
 def _starts(found: Sequence[dict]) -> str:
@@ -114,9 +125,20 @@ def _rows(measurement: dict) -> dict[str, dict]:
 
 
 def _controls(found: Sequence[dict]) -> dict[str, dict]:
-    """The rows of the controls: of the first measurement that has them."""
-    rows = next((own for own in map(_rows, found) if RANDOM in own), {})
-    return {name: rows[name] for name in IN_TABLE if name in rows}
+    """The rows of the controls: of the first run that has them; other goals, of each arm's."""
+    controls: dict[str, dict] = {}
+    for own in found:
+        rows = _rows(own)
+        for name in CONTROLS:
+            if name in rows:
+                controls.setdefault(name, rows[name])
+    several = len({own['arm'] for own in found}) > 1
+    for own in found:
+        rows = _rows(own)
+        for name in OTHER_GOALS:
+            if name in rows:
+                controls.setdefault(f'{own["arm"]}: {name}' if several else name, rows[name])
+    return controls
 
 
 def _figures(experiment: Experiment, runs: Sequence[Run], measured: Sequence[dict]
@@ -168,7 +190,7 @@ def _when(points: Sequence[float | None], limits: Sequence[float]) -> str:
     missed = [limit / 1e3 for point, limit in zip(points, limits, strict=True) if point is None]
     if not missed:
         return spread(got, ',.0f')
-    never = f'not within {min(missed):,.0f}'
+    never = f'not held by {(1 - HOLD_SHARE) * min(missed):,.0f}'  # later ones cannot hold
     if not got:
         return never
     return f'{", ".join(f"{point:,.0f}" for point in sorted(got))}; {len(missed)} {never}'

@@ -8,7 +8,7 @@ from typing import Any
 
 from vn_nav.errors import UserError
 from vn_nav.robot import DRIVE_ACTIONS, NamedAction, RobotSpec
-from vn_nav.scenes import one_simulator
+from vn_nav.scenes import HOUSE, one_simulator
 from vn_sim_bridge.floor.places import have_floors
 from vn_sim_bridge.navigation.episodes import MIN_START_DISTANCE
 from vn_sim_bridge.render.randomisation import Randomisation
@@ -247,3 +247,29 @@ def check_simulator(simulator: Simulator, config: EnvConfig, robot: RobotSpec, *
         if not kept:
             raise UserError(rule, received, 'correct the environment configuration, or choose '
                             'another simulator (vn_nav simulators)')
+
+
+def not_on_device(config: EnvConfig) -> UserError | None:
+    """What of a configuration `WarpNavigationEnv` cannot do, in words; None: it does all of it."""
+    simulator, _ = one_simulator(config.scenes)
+    teachers = sorted(set(config.privileged) & {'explorer_action', 'oracle_action'})
+    rules = (
+        (config.task == 'image' and not config.one_goal_per_env,
+         'the device runs the image task with goals drawn each episode', config.task,
+         'use --device cpu'),
+        (config.stop == 'arrival' and not config.exploration_reward,
+         'on the device episodes end on arrival, and new floor pays nothing',
+         (config.stop, config.exploration_reward), 'use --device cpu'),
+        (not config.noise or config.turn_noise,
+         'on the device turns are as noisy as moves, or nothing is', 'turn_noise=False',
+         'use --device cpu'),
+        (config.odometry == 'none', 'robots on the device have no odometry', config.odometry,
+         'use --device cpu, or odometry none'),
+        (config.ranges == 'picture', 'robots on the device measure no ranges', config.ranges,
+         'use --device cpu, or ranges picture'),
+        (not teachers, 'teachers plan on the CPU (none with --set imitation=0 --set '
+         'teacher_share=0)', ', '.join(teachers), 'use --device cpu'),
+        (not config.randomisation.late_picture, 'pictures are never late on the device',
+         config.randomisation.late_picture, 'use --device cpu'),
+        (simulator == HOUSE, 'the device draws embedded houses', simulator, 'use --device cpu'))
+    return next((UserError(*words) for holds, *words in rules if not holds), None)

@@ -22,7 +22,7 @@ from vn_nav.scenes import HOUSE, one_simulator
 from vn_sim_bridge.counter_random import Stream, key
 from vn_sim_bridge.houses.labels import LABELS
 from vn_sim_bridge.navigation import tasks
-from vn_sim_bridge.navigation.env_config import EnvConfig
+from vn_sim_bridge.navigation.env_config import EnvConfig, not_on_device
 from vn_sim_bridge.navigation.warp_decisions import decide, restart, share_in_view
 from vn_sim_bridge.navigation.warp_state import (
     MODES,
@@ -39,9 +39,6 @@ from vn_sim_bridge.render.scene import Scene
 from vn_sim_bridge.render.warp_renderer import WarpRenderer
 from vn_sim_bridge.simulators.house import WORLD_VERSION, open_houses
 
-# Teachers plan on the CPU: `NavigationEnv` alone knows them.
-TEACHERS = ('explorer_action', 'oracle_action')
-
 
 class WarpNavigationEnv:
     """Image-goal navigation on one device; see `NavigationEnv` for what it simulates.
@@ -52,7 +49,7 @@ class WarpNavigationEnv:
     as well.
 
     Args:
-        config: task 'image', without late pictures or odometry; none of `TEACHERS` is privileged.
+        config: task 'image', and what else `not_on_device` asks for.
         robot: the standard robot if left out.
         device: Warp device, such as 'cuda:0' or 'cpu'.
     """
@@ -60,31 +57,9 @@ class WarpNavigationEnv:
     def __init__(self, config: EnvConfig | None = None, robot: RobotSpec | None = None, *,
                  device: str = 'cuda:0'):
         self.config = config = config or EnvConfig()
-        if config.task != 'image' or config.one_goal_per_env:
-            raise UserError('the device runs the image task with goals drawn each episode',
-                            config.task, 'use NavigationEnv')
-        if config.stop != 'arrival' or config.exploration_reward:
-            raise UserError('on the device episodes end on arrival, and new floor pays nothing',
-                            (config.stop, config.exploration_reward), 'use NavigationEnv')
-        if config.noise and not config.turn_noise:
-            raise UserError('on the device turns are as noisy as moves, or nothing is',
-                            'turn_noise=False', 'use NavigationEnv')
-        if config.odometry != 'none':
-            raise UserError('robots on the device have no odometry', config.odometry,
-                            'use NavigationEnv (--device cpu), or odometry none')
-        if config.ranges != 'picture':
-            raise UserError('robots on the device measure no ranges', config.ranges,
-                            'use NavigationEnv (--device cpu), or ranges picture')
-        if teachers := sorted(set(config.privileged) & set(TEACHERS)):
-            raise UserError('teachers plan on the CPU: the device tells no actions to imitate',
-                            ', '.join(teachers), 'set imitation=0 and teacher_share=0 (--set '
-                            'NAME=VALUE), or train on the CPU')
-        if config.randomisation.late_picture:
-            raise UserError('pictures are never late on the device',
-                            config.randomisation.late_picture, 'use NavigationEnv')
-        simulator, scenes = one_simulator(config.scenes)
-        if simulator != HOUSE:
-            raise UserError('the device draws embedded houses', simulator, 'use NavigationEnv')
+        if refusal := not_on_device(config):
+            raise refusal
+        _, scenes = one_simulator(config.scenes)
         self.robot = (robot or RobotSpec()).with_actions(config.actions)
         self.num_envs, self.device = config.num_envs, device
         if wp.get_device(device).is_cuda:
