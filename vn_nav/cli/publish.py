@@ -25,6 +25,8 @@ from vn_nav.scenes import HOUSE, house_scene, parse_scene, rooms_of, scene_name
 STOP_THRESHOLDS = (0.3, 0.5, 0.7, 0.85, 0.95)  # that are tried
 SEARCH_THRESHOLDS = (0.8, 0.9, 0.95)  # the same of a policy that searches
 THRESHOLD_SEED = 20_000  # of starts that no figure is from
+NOISE = {'all': 'motion noise on', 'moves': 'motion noise along moves alone',
+         'none': 'no motion noise'}  # by the name of `MOTION_NOISE`
 # What an earlier publication said of its figures.
 MEASURED = re.compile(r' ?Measured with `vn_nav publish`.*?docs/architecture\.md\.', re.DOTALL)
 
@@ -91,7 +93,8 @@ def run(args: argparse.Namespace) -> int:
                                 for row, figures in rows.items()}
             counts |= {figures['episodes'] for figures in rows.values()}
     info['notes'] = _notes(info['notes'] if args.notes is None else args.notes,
-                           sorted(counts), odometry_for(shipped.network), chosen)
+                           sorted(counts), odometry_for(shipped.network), info['motion_noise'],
+                           chosen)
     save_checkpoint(args.target, shipped.network, info, half=True)
     return 0
 
@@ -228,12 +231,12 @@ def threshold_scenes(info: dict, measured: Sequence[str], count: int, *, others:
     return list(info['scenes'] or measured)[:count]
 
 
-def _notes(training: str, counts: Sequence[int], odometry: str, chosen: str) -> str:
+def _notes(training: str, counts: Sequence[int], odometry: str, noise: str, chosen: str) -> str:
     """What the card says of the training, and of how its figures were measured."""
     episodes = ' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))
     given = '' if odometry == 'none' else f'odometry: {odometry}, '
     measured = (f'Measured with `vn_nav publish`, {episodes} episodes a row, 300 decisions at '
-                f'most, motion noise on, {given}on {machine()}, '
+                f'most, {NOISE[noise]}, {given}on {machine()}, '
                 f'{datetime.date.today().isoformat()}. {chosen}Figures are defined in '
                 'docs/architecture.md.')
     return f'{MEASURED.sub("", training).strip()} {measured}'.strip()
