@@ -81,7 +81,8 @@ def test_every_arm_is_a_training_that_the_command_line_takes(name, size, tmp_pat
         args = parser.parse_args(own.train_command(arm, 1))
         config, world = train_config(args), world_options(args)
         assert config.seed == 1 and config.threads == 1
-        assert config.frames == own.experiment.sizes[size]['frames']
+        sized = own.experiment.sizes[size]
+        assert config.frames == sized.get('arms', {}).get(arm, sized)['frames']
         assert args.size in (84, 174) and world['envs'] == 16  # table 5.1
         assert '{' not in ' '.join(own.train_command(arm, 1))
         if args.robot:
@@ -142,7 +143,8 @@ def test_options_become_a_command_line():
     (('title: small\n', ''), 'title'), (('metric: length', 'metric: [1]'), 'metric'),
     (('reach: [1000, 1]', 'reach: [much]'), 'reach'), (('falls: true', 'falls: maybe'), 'falls'),
     (('  full: {size: 174, frames: 1_000_000}\n', ''), 'sizes'), (('arms:', 'arm:'), 'arm'),
-    (('  LSTM: {}', '  LSTM: 3'), 'arms'), (('makes:', 'made:'), 'prepare'),
+    (('  LSTM: {}', '  LSTM: 3'), 'arms'),
+    (('{size: 84, frames: 1300}', '{size: 84, arms: {GRU: {frames: 3}}}'), 'GRU'), (('makes:', 'made:'), 'prepare'),
 ])
 def test_a_file_that_is_no_experiment_is_refused(change, named, tmp_path):
     with pytest.raises(UserError, match=named):

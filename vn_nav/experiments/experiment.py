@@ -12,7 +12,7 @@ A YAML file in `config/experiments` (or a user's own) has these keys:
 | `prepare` | commands of `vn_nav` that make files, each once: `makes` and `command` |
 | `train`, `evaluate` | options of these commands, of every run |
 | `arms` | what is compared: options of `vn_nav train`, by name |
-| `sizes` | `quick` and `full`: further options of `vn_nav train` |
+| `sizes` | `quick` and `full`: further options of `vn_nav train`; `arms` in it: of some arms |
 
 In texts of options and commands `{files}` is the folder of prepared files, `{share}` that of the
 files which ship with the code, and `{name}`, for any option of the size, its value; in a command
@@ -67,7 +67,8 @@ class Experiment:
 
     def options(self, arm: str, size: str) -> dict[str, Any]:
         """The options of `vn_nav train` of an arm; what is said later counts."""
-        parts = self.train, self.sizes[size], self.arms[arm]
+        sized = dict(self.sizes[size])
+        parts = self.train, sized, self.arms[arm], sized.pop('arms', {}).get(arm, {})
         merged = {key: value for part in parts for key, value in part.items()}
         if sets := {key: value for part in parts for key, value in part.get('set', {}).items()}:
             merged['set'] = sets
@@ -102,6 +103,11 @@ def load_experiment(name: str) -> Experiment:
                             f'{", ".join(sorted(set(fields) - needed - {"name"}))}',
                             f'{path}: {", ".join(sorted(wrong))}', REMEDY)
     _check(given, path)
+    for size in given['sizes'].values():
+        own = size.get('arms', {})
+        if not isinstance(own, dict) or set(own) - set(given['arms']):
+            raise UserError('arms of a size are options by name, of arms of the experiment',
+                            f'{path}: {own!r}'[:200], REMEDY)
     steps = tuple(Step(**step) for step in given.pop('prepare', ()))
     return Experiment(name=path.stem, prepare=steps,
                       reach=tuple(map(float, given.pop('reach', ()))), **given)
