@@ -1,9 +1,9 @@
 """Runs an experiment: files, trainings with several seeds, measurements; keeps what stays.
 
 `OUT/NAME-SIZE/` gets the runs and `RESULTS/NAME-SIZE/` what stays of them: a folder for each run
-with its thinned curve and its measurement, the chart, the table and the page (`NAME-SIZE-FRAMES`
-where somebody tries it with fewer frames). A run whose
+with its thinned curve and its measurement, the chart, the table and the page. A run whose
 measurement is among the results is not repeated, on any machine; one that was interrupted goes on.
+A try with fewer frames has folders of its own, `NAME-SIZE-FRAMES`.
 """
 
 from __future__ import annotations
