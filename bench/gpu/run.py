@@ -33,6 +33,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from vn_nav.cli.interruption import ended_as_by_ctrl_c
 from vn_nav.scenes import house_scenes
 
 PARTS = ('render', 'train', 'learn', 'export')
@@ -407,7 +408,12 @@ def main():
                 REPRODUCE: reproduce}[part]
         work(arguments, *([name] if name else []))
         return
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with ended_as_by_ctrl_c():
+        sys.exit(run_all(arguments) > 0)
+
+
+def run_all(arguments) -> int:
+    """Every job within what is left of the time; how many failed."""
     begun, failed = time.monotonic(), 0
     for job in jobs(arguments):
         left = 60 * arguments.limit_minutes - (time.monotonic() - begun)
@@ -419,7 +425,7 @@ def main():
             failed += 1
             say(arguments, job, None, '', f'limit {arguments.limit_minutes:g} minutes',
                 error=f'{type(error).__name__}: {str(error)[-300:]}')
-    sys.exit(failed > 0)
+    return failed
 
 
 if __name__ == '__main__':

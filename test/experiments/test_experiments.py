@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -290,6 +291,7 @@ def test_the_runs_that_ship_are_those_of_the_experiments():
         own = Reproduction(load_experiment(name), 'quick', Path('runs'), CURVES_OF_THE_DOCS)
         for path in own.kept.glob('*/evaluation.json'):
             found = json.loads(path.read_text())
+            assert not re.search(r'["=]/', path.read_text()), f'{path}: a path of one machine'
             own._check(found['arm'], found['options'], path.parent)
             assert path.parent.name == own.run_name(found['arm'], found['seed'])
 
