@@ -146,7 +146,7 @@ def test_options_become_a_command_line():
     (('  full: {size: 174, frames: 1_000_000}\n', ''), 'sizes'), (('arms:', 'arm:'), 'arm'),
     (('  LSTM: {}', '  LSTM: 3'), 'arms'),
     (('{size: 84, frames: 1300}', '{size: 84, arms: {GRU: {frames: 3}}}'), 'GRU'),
-    (('makes:', 'made:'), 'prepare'),
+    (('makes:', 'made:'), 'prepare'), (('command: "house', 'size: half\n    command: "house'), 'half'),
 ])
 def test_a_file_that_is_no_experiment_is_refused(change, named, tmp_path):
     with pytest.raises(UserError, match=named):
@@ -314,6 +314,19 @@ def test_files_are_made_again_by_another_command(tmp_path, monkeypatch):
     for text in (SMALL, SMALL, SMALL.replace('--rooms 1', '--rooms 2'), SMALL):
         reproduction(small(tmp_path, text), tmp_path)._prepare([0], print)
     assert [command[5] for command in made] == ['1', '2', '1']
+
+
+def test_a_size_makes_what_it_needs(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr('vn_nav.experiments.jobs.run',
+                        lambda jobs, cores, say: made.extend(job.commands[0] for job in jobs))
+    for size in SIZES:
+        reproduction('fig5.7', tmp_path, size)._prepare([0], print)
+        made.append([size])
+    quick, full = made[:made.index(['quick'])], made[made.index(['quick']) + 1:-1]
+    for commands, houses in ((quick, 4), (full, 16)):
+        assert [words[0] for words in commands] == ['house'] * houses + ['collect', 'pretrain']
+        assert commands[-2].count('--scene') == houses
 
 
 def test_each_arm_is_shown_other_goals(tmp_path):

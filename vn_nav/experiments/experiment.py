@@ -9,7 +9,8 @@ A YAML file in `config/experiments` (or a user's own) has these keys:
 | `reach` | values of the metric whose first lasting reach is in the table |
 | `falls` | whether less of the metric is better (default: no) |
 | `in_curriculum` | whether a value inside the curriculum counts (default: no) |
-| `prepare` | commands of `vn_nav` that make files, each once: `makes` and `command` |
+| `prepare` | commands of `vn_nav` that make files, each once: `makes`, `command`, and `size` where |
+|           | only one of the sizes needs it |
 | `train`, `evaluate` | options of these commands, of every run |
 | `arms` | what is compared: options of `vn_nav train`, by name |
 | `sizes` | `quick` and `full`: further options of `vn_nav train`; `arms` in it: of some arms |
@@ -45,6 +46,7 @@ class Step:
 
     makes: str
     command: str
+    size: str | None = None  # the only one that needs it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +128,10 @@ def _check(given: dict[str, Any], path: Path) -> None:
     def are_options(value) -> bool:
         return isinstance(value, dict) and bool(value) and all(map(is_options, value.values()))
 
+    def is_step(value) -> bool:
+        return isinstance(value, dict) and all(isinstance(text, str) for text in value.values()) and (
+            set(value) - {'size'} == {'makes', 'command'} and value.get('size', SIZES[0]) in SIZES)
+
     def is_number(value) -> bool:
         return isinstance(value, (int, float)) and not isinstance(value, bool)
     rules = (
@@ -142,9 +148,8 @@ def _check(given: dict[str, Any], path: Path) -> None:
         ('arms', 'options by name, by arm', are_options),
         ('sizes', f'options by name, of {" and ".join(SIZES)}',
          lambda value: are_options(value) and set(value) == set(SIZES)),
-        ('prepare', 'a list of texts makes and command', lambda value: isinstance(value, list)
-         and all(isinstance(step, dict) and set(step) == {'makes', 'command'}
-                 and all(isinstance(text, str) for text in step.values()) for step in value)),
+        ('prepare', 'a list of texts makes and command, and the size that alone needs it',
+         lambda value: isinstance(value, list) and all(map(is_step, value))),
     )
     for key, kind, fits in rules:
         if key in given and not fits(given[key]):

@@ -158,6 +158,8 @@ class Reproduction:
         (self.out / self.folder / 'files').mkdir(parents=True, exist_ok=True)
         log = self.out / self.folder / 'prepare.log'
         for step in self.experiment.prepare:
+            if step.size not in (None, self.size):
+                continue
             target = Path(filled(step.makes, self.values))
             done = target.with_name(target.name + '.done')  # by which command
             command = [word for part in step.command.split()
