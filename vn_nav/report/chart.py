@@ -102,9 +102,12 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
     shapes += [Line(np.array([[left, bottom], [right, bottom]]), 'soft'),
                Text((left + right) / 2, bottom + 40, title, 'middle', 'ink', 13)]
     for name, y in (levels or {}).items():
-        below = bottom - up(y) < (bottom - top) / 3 and bottom - up(y) > 20  # curves end above
+        below = bottom - up(y) < (bottom - top) / 3 and bottom - up(y) > 20  # curves are above
+        first, last = (min((abs(own.mean[end] - y) for own in series), default=0.0)
+                       for end in (0, -1))
+        x, anchor = (left + 4, 'start') if first > last else (right - 4, 'end')  # no curve there
         shapes += [Line(np.array([[left, up(y)], [right, up(y)]]), 'ink', 1.2),
-                   Text(right - 4, up(y) + (14 if below else -5), name, 'end', 'ink', 11)]
+                   Text(x, up(y) + (14 if below else -5), name, anchor, 'ink', 11)]
     for s in series:
         along = np.array([across(value) for value in s.x])
         outline = np.concatenate([np.stack([along, up(s.high)], 1),
