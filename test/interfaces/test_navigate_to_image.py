@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import rclpy
 from fake_robot import RELIABLE, FakeRobot
+from lifecycle_msgs.msg import Transition
 from paths import ROOT, TESTS
 from ros_harness import PATIENT, child, wait_until, write_checkpoint
 from std_srvs.srv import SetBool, Trigger
@@ -197,6 +198,15 @@ def test_a_client_hears_that_a_person_or_the_process_ends_it(with_action, robot,
                 robot.commands.clear()
             if '~/stop' in words:
                 assert robot.call(Trigger, 'reset').success
+    with child('vn_nav.nodes.policy_node', tmp_path / 'log2', checkpoint=unsure, **PATIENT):
+        def shut_down():
+            wait_until(robot.moving, robot.spin, 100)
+            assert robot.transition(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+
+        (left,) = results(robot, with_action, [{}], meanwhile=shut_down)
+        assert (left['status'], left['code']) == (ABORTED, Code.STOPPED), left
+        assert 'shut down' in left['message']
+        assert robot.state() == 'finalized'
 
 
 @pytest.mark.ros

@@ -85,8 +85,11 @@ class NavigateAction:
             cancel_callback=lambda _: CancelResponse.ACCEPT)
 
     def destroy(self) -> None:
-        """Take it off the graph."""
-        self._server.destroy()
+        """Take it off the graph, after the two tasks that `finish` has left to the executor."""
+        if (executor := self._node.executor) is None:
+            self._server.destroy()
+        else:
+            executor.create_task(lambda: executor.create_task(self._server.destroy))
 
     def halt(self, reason: str) -> None:
         """End the goal under way, if any: the node stops acting."""
