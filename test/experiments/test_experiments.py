@@ -146,7 +146,8 @@ def test_options_become_a_command_line():
     (('  full: {size: 174, frames: 1_000_000}\n', ''), 'sizes'), (('arms:', 'arm:'), 'arm'),
     (('  LSTM: {}', '  LSTM: 3'), 'arms'),
     (('{size: 84, frames: 1300}', '{size: 84, arms: {GRU: {frames: 3}}}'), 'GRU'),
-    (('makes:', 'made:'), 'prepare'), (('command: "house', 'size: half\n    command: "house'), 'half'),
+    (('makes:', 'made:'), 'prepare'),
+    (('  - makes:', '  - size: half\n    makes:'), 'half'),
 ])
 def test_a_file_that_is_no_experiment_is_refused(change, named, tmp_path):
     with pytest.raises(UserError, match=named):

@@ -9,8 +9,7 @@ A YAML file in `config/experiments` (or a user's own) has these keys:
 | `reach` | values of the metric whose first lasting reach is in the table |
 | `falls` | whether less of the metric is better (default: no) |
 | `in_curriculum` | whether a value inside the curriculum counts (default: no) |
-| `prepare` | commands of `vn_nav` that make files, each once: `makes`, `command`, and `size` where |
-|           | only one of the sizes needs it |
+| `prepare` | commands of `vn_nav` that make files, each once: `makes`, `command`; `size`, if one needs it |
 | `train`, `evaluate` | options of these commands, of every run |
 | `arms` | what is compared: options of `vn_nav train`, by name |
 | `sizes` | `quick` and `full`: further options of `vn_nav train`; `arms` in it: of some arms |
@@ -129,8 +128,9 @@ def _check(given: dict[str, Any], path: Path) -> None:
         return isinstance(value, dict) and bool(value) and all(map(is_options, value.values()))
 
     def is_step(value) -> bool:
-        return isinstance(value, dict) and all(isinstance(text, str) for text in value.values()) and (
-            set(value) - {'size'} == {'makes', 'command'} and value.get('size', SIZES[0]) in SIZES)
+        return (isinstance(value, dict) and set(value) - {'size'} == {'makes', 'command'}
+                and all(isinstance(text, str) for text in value.values())
+                and value.get('size', SIZES[0]) in SIZES)
 
     def is_number(value) -> bool:
         return isinstance(value, (int, float)) and not isinstance(value, bool)
