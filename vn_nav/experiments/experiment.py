@@ -9,7 +9,7 @@ A YAML file in `config/experiments` (or a user's own) has these keys:
 | `reach` | values of the metric whose first lasting reach is in the table |
 | `falls` | whether less of the metric is better (default: no) |
 | `in_curriculum` | whether a value inside the curriculum counts (default: no) |
-| `prepare` | commands of `vn_nav` that make files, each once: `makes`, `command`; `size`, if one needs it |
+| `prepare` | commands that make files: `makes`, `command`, and `size` if only one needs it |
 | `train`, `evaluate` | options of these commands, of every run |
 | `arms` | what is compared: options of `vn_nav train`, by name |
 | `sizes` | `quick` and `full`: further options of `vn_nav train`; `arms` in it: of some arms |
