@@ -25,7 +25,6 @@ EXCEPTIONS = {
     ('docs/method.md', 'Recall of a taught place'): 'a constant of the evidence',
     ('docs/bags.md', 'Pictures'): 'limits', ('docs/bags.md', 'Teach'): 'defaults of options',
     ('docs/bags.md', 'Online'): 'defaults of options; its rate stands in performance.md',
-    ('docs/reproduce.md', 'What differs from the thesis'): 'episodes a goal, by division',
     ('docs/scaling.md', 'Cost model'): 'sizes of messages, from the number of parameters',
     ('docs/scaling.md', 'Planned: 8 and 64 GPUs'): 'a plan, from data sheets',
     ('docs/simulators/suncg.md', 'RoomNav'): "a constant of House3D's rule",
