@@ -317,17 +317,14 @@ def test_files_are_made_again_by_another_command(tmp_path, monkeypatch):
     assert [command[5] for command in made] == ['1', '2', '1']
 
 
-def test_a_size_makes_what_it_needs(tmp_path, monkeypatch):
+@pytest.mark.parametrize('size, houses', [('quick', 4), ('full', 16)])
+def test_a_size_makes_what_it_needs(size, houses, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr('vn_nav.experiments.jobs.run',
                         lambda jobs, cores, say: made.extend(job.commands[0] for job in jobs))
-    for size in SIZES:
-        reproduction('fig5.7', tmp_path, size)._prepare([0], print)
-        made.append([size])
-    quick, full = made[:made.index(['quick'])], made[made.index(['quick']) + 1:-1]
-    for commands, houses in ((quick, 4), (full, 16)):
-        assert [words[0] for words in commands] == ['house'] * houses + ['collect', 'pretrain']
-        assert commands[-2].count('--scene') == houses
+    reproduction('fig5.7', tmp_path, size)._prepare([0], print)
+    assert [words[0] for words in made] == ['house'] * houses + ['collect', 'pretrain']
+    assert made[-2].count('--scene') == houses
 
 
 def test_each_arm_is_shown_other_goals(tmp_path):

@@ -15,6 +15,7 @@ from vn_nav.report.page import COLOURS, LIGHT
 DASH = 6.0, 4.0  # pixels drawn and left out
 FONT = 'system-ui, sans-serif'
 LABEL_MARGIN = 0.3  # of a step, left and right of an axis of labels
+NAME_WIDTH = 90.0  # of a level, about [pixels]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +89,12 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
     def up(y):
         return bottom - (np.clip(y, y0, y1) - y0) / (y1 - y0) * (bottom - top)
 
+    def clear(begin: float, y: float) -> float:
+        """How far the curves stay from a value where its name would stand."""
+        return min((abs(float(mean) - y) for own in series
+                    for x, mean in zip(own.x, own.mean, strict=True)
+                    if begin <= across(x) <= begin + NAME_WIDTH), default=math.inf)
+
     shapes: list[Shape] = []
     for y in ticks(y0, y1):
         shapes += [Line(np.array([[left, up(y)], [right, up(y)]]), 'line'),
@@ -103,9 +110,10 @@ def panel(box: tuple[float, float, float, float], series: Sequence[Series], *, t
                Text((left + right) / 2, bottom + 40, title, 'middle', 'ink', 13)]
     for name, y in (levels or {}).items():
         below = bottom - up(y) < (bottom - top) / 3 and bottom - up(y) > 20  # curves are above
-        first, last = (min((abs(own.mean[end] - y) for own in series), default=0.0)
-                       for end in (0, -1))
-        x, anchor = (left + 4, 'start') if first > last else (right - 4, 'end')  # no curve there
+        middle = (left + right) / 2
+        places = ((right - NAME_WIDTH, right - 4, 'end'), (left, left + 4, 'start'),
+                  (middle - NAME_WIDTH / 2, middle, 'middle'))
+        _, x, anchor = max(places, key=lambda place: clear(place[0], y))
         shapes += [Line(np.array([[left, up(y)], [right, up(y)]]), 'ink', 1.2),
                    Text(x, up(y) + (14 if below else -5), name, anchor, 'ink', 11)]
     for s in series:
