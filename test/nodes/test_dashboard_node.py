@@ -168,7 +168,10 @@ def test_the_page_in_a_browser(robot, tmp_path):
         assert page.value('document.querySelectorAll("#pictures .chosen").length') == 1
         page.click('#pictures button:first-child')
         page.wait_for('document.querySelector("#pictures button").className == "chosen"')
+        # A file that is chosen while another answer is waited for is sent after it.
+        page.value('wait(1)')
         page.upload('#file', photograph(tmp_path / 'goal.png'))
+        page.value('wait(-1)')
         page.wait_for('document.getElementById("said").textContent.includes("160 x 120")')
         page.wait_for('document.getElementById("goal").naturalWidth == 160')
         picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)

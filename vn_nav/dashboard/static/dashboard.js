@@ -16,6 +16,15 @@ function wait(more) {
   waiting += more;
   document.querySelectorAll('button:not(#stop), #file').forEach(
     (one) => { one.disabled = waiting > 0; });
+  if (!waiting) sendFile();
+}
+
+// A file that is chosen while an answer is waited for is sent after it.
+function sendFile() {
+  const [file] = $('file').files;
+  if (!file || waiting) return;
+  $('file').value = '';
+  ask('goal', file);
 }
 
 async function ask(address, body) {
@@ -179,10 +188,7 @@ function showBag() {
 $('stop').addEventListener('click', stop);
 $('enable').addEventListener('click', () => ask('enable'));
 $('reset').addEventListener('click', () => ask('reset'));
-$('file').addEventListener('change', () => {
-  if ($('file').files.length) ask('goal', $('file').files[0]);
-  $('file').value = '';
-});
+$('file').addEventListener('change', sendFile);
 // Whatever has the focus: the space bar must not press Enable again.
 document.addEventListener('keydown', (event) => {
   if ((event.key === 'Escape' || event.key === ' ') && !event.repeat) stop(event);
