@@ -4,9 +4,10 @@
     python bench/figures.py --changed    # and which commits those are: make figures CHANGED=1
 
 `docs/figures.yaml` says of each figure where it stands, the command that makes it, when and on
-which commit it was measured, and which files it measures. The last column counts the commits that
-have touched these files since; 0: the figure is of today's code. A commit that changes no
-behaviour counts as well: look at it before you measure again.
+which commit it was measured, and which files it measures. The last column says how much of these
+files has changed since: statements that are new or gone, without comments, docstrings and format,
+and without those that only moved. 0 %: the figure is of today's code. A change of names counts as
+well: look at the commits before you measure again.
 
 The exit code is 0, and 2 with one line where the registry is broken.
 """
@@ -14,13 +15,16 @@ The exit code is 0, and 2 with one line where the registry is broken.
 from __future__ import annotations
 
 import argparse
+import ast
 import dataclasses
 import datetime
+import hashlib
 import re
 import shlex
 import subprocess
 import sys
 import textwrap
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -34,8 +38,9 @@ WHAT, MEND = 'the registry of figures', f'mend {REGISTRY}'
 NONE = 'none'  # in place of a command, together with a reason
 KEYS = {'file', 'section', 'command', 'date', 'commit', 'machine', 'code'}
 OPTIONAL = {'figures', 'reason'}
-COLUMNS = (('section', 28), ('command', 29), ('date', 10), ('commits', 7))  # 80 characters
+COLUMNS = (('section', 28), ('command', 29), ('date', 10), ('changed', 7))  # 80 characters
 GAP = '  '
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +178,23 @@ def _goals(root: Path) -> set[str]:
     return set(found.group(1).split()) if found else set()
 
 
+def statements(path: str, content: bytes) -> Counter[str]:
+    """What a file says: its lines; of Python without comments, docstrings and format.
+
+    Of a file that is no text: one line, as good as its content.
+    """
+    if b'\0' in content:
+        return Counter([f'{path}: {hashlib.sha256(content).hexdigest()}'])
+    text = content.decode(errors='replace')
+    if path.endswith('.py'):
+        tree = ast.parse(text)
+        for node in ast.walk(tree):
+            if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+                node.body = node.body[1:] or [ast.Pass()]
+        text = ast.unparse(tree)
+    return Counter(line for line in text.splitlines() if line.strip())
+
+
 class History:
     """The commits of the repository.
 
@@ -182,6 +204,7 @@ class History:
 
     def __init__(self, root: Path):
         self.root = root
+        self._known: dict[tuple[str, str], Counter[str]] = {}  # by object and path
         try:
             top, shallow = self._git('rev-parse', '--show-toplevel',
                                      '--is-shallow-repository').splitlines()
@@ -220,6 +243,25 @@ class History:
                                     f'{figure.name}: {path}', MEND)
                 known.add(path)
 
+    def changed(self, figure: Figure) -> float:
+        """Which share of what a figure measures is new or gone since, 0 to 1."""
+        then, now = self._statements(figure.commit, figure), self._statements('HEAD', figure)
+        most = max(then.total(), now.total(), 1)
+        return max((now - then).total(), (then - now).total()) / most
+
+    def _statements(self, commit: str, figure: Figure) -> Counter[str]:
+        """Those of the files that a figure measures, in the tree of a commit."""
+        total: Counter[str] = Counter()
+        for line in self._git('ls-tree', '-r', commit, '--', *figure.code).splitlines():
+            about, path = line.split('\t')
+            name = about.split()[2]
+            if (name, path) not in self._known:
+                content = subprocess.run(['git', 'cat-file', 'blob', name], cwd=self.root,
+                                         check=True, capture_output=True).stdout
+                self._known[name, path] = statements(path, content)
+            total += self._known[name, path]
+        return total
+
     def since(self, figure: Figure) -> list[str]:
         """The commits that have touched what a figure measures: 'hash date subject' each."""
         return self._git('log', '--no-merges', '--format=%h %as %s', f'{figure.commit}..HEAD',
@@ -240,23 +282,29 @@ def row(cells: Sequence[str]) -> list[str]:
     return lines
 
 
-def table(figures: Sequence[Figure], commits: Sequence[Sequence[str]], changed: bool) -> str:
-    """The table, page by page; with `changed` the commits below each row."""
+def percent(share: float) -> str:
+    """A share in whole percents; what is no zero is none."""
+    return '<1 %' if 0 < share < 0.005 else f'{share:.0%}'.replace('%', ' %')
+
+
+def table(figures: Sequence[Figure], changed: Sequence[float],
+          commits: Sequence[Sequence[str]]) -> str:
+    """The table, page by page; the commits of each figure below its row."""
     lines = [*row([name for name, _ in COLUMNS]), *row(['-' * width for _, width in COLUMNS])]
     for file in dict.fromkeys(figure.file for figure in figures):
         lines += ['', file]
-        for figure, found in zip(figures, commits, strict=True):
+        for figure, share, found in zip(figures, changed, commits, strict=True):
             if figure.file != file:
                 continue
             section = figure.section + (f': {figure.figures}' if figure.figures else '')
             lines += row([section, '\n'.join(figure.commands) or NONE, figure.date,
-                          str(len(found))])
-            if changed:
-                lines += [f'    {textwrap.shorten(commit, 76, placeholder="...")}'
-                          for commit in found]
-    older, without = sum(map(bool, commits)), sum(not figure.commands for figure in figures)
-    return '\n'.join([*lines, '', f'{len(figures)} entries: {older} older than their code; '
-                      f'{without} without a command.'])
+                          percent(share)])
+            lines += [f'    {textwrap.shorten(commit, 76, placeholder="...")}'
+                      for commit in found]
+    older, much = sum(map(bool, changed)), sum(share > 0.1 for share in changed)
+    without = sum(not figure.commands for figure in figures)
+    return '\n'.join([*lines, '', f'{len(figures)} entries: {older} older than their code ({much} '
+                      f'by over 10 %), {without} without a command.'])
 
 
 def main(root: Path = ROOT) -> int:
@@ -276,7 +324,8 @@ def main(root: Path = ROOT) -> int:
     except UserError as error:
         print(f'bench/figures.py: {error}', file=sys.stderr)
         return 2
-    print(table(figures, [history.since(figure) for figure in figures], options.changed))
+    print(table(figures, [history.changed(figure) for figure in figures],
+                [history.since(figure) if options.changed else [] for figure in figures]))
     return 0
 
 

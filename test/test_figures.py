@@ -122,7 +122,7 @@ def project(tmp_path):
     commit(folder, 'README.md', '# Fast\n\n## Speed\n\n9,000 frames/s\n')
     commit(folder, 'Makefile', '.PHONY: demo test\n')
     commit(folder, 'bench/speed.py', '')
-    return folder, commit(folder, 'code/loop.py', 'slow')
+    return folder, commit(folder, 'code/loop.py', 'begin\nslow\nend\n')
 
 
 def register(folder, entry, **changes):
@@ -138,23 +138,57 @@ def call(folder, monkeypatch, capsys, *words):
     return code, capsys.readouterr()
 
 
+def test_statements_of_a_program_are_its_code():
+    written = b'''"""What it is."""
+import os  # for later
+
+class Loop:
+    """Slow."""
+
+    def run(self, *,
+            frames):
+        """Go."""
+        return [frames,
+                os]
+'''
+    expected = ['import os', 'class Loop:', '    def run(self, *, frames):',
+                '        return [frames, os]']
+    assert list(figures.statements('code/loop.py', written)) == expected
+    assert list(figures.statements('code/loop.yaml', b'a: 1\n\nb: 2\n')) == ['a: 1', 'b: 2']
+    one, other = (figures.statements('model.bin', content) for content in (b'\0a', b'\0b'))
+    assert one.total() == other.total() == 1 and one != other
+
+
 @pytest.mark.slow
-def test_commits_that_touch_the_code_are_counted(project, monkeypatch, capsys):
+def test_changed_statements_are_counted(project, monkeypatch, capsys):
     folder, measured = project
     register(folder, ENTRY, commit=measured)
     code, said = call(folder, monkeypatch, capsys)
-    assert code == 0 and '1 entries: 0 older than their code; 0 without a command.' in said.out
+    none = '1 entries: 0 older than their code (0 by over 10 %), 0 without a command.'
+    assert code == 0 and none in said.out
+    # Another text, format and place change nothing.
     commit(folder, 'README.md', '# Fast\n\n## Speed\n\n9,000 frames/s, measured\n')
-    commit(folder, 'code/loop.py', 'fast')
-    changed = commit(folder, 'bench/speed.py', '# another way to count')
+    commit(folder, 'bench/speed.py', '# another way to count\n')
+    git(folder, 'mv', 'code/loop.py', 'code/loops.py')
+    git(folder, 'commit', '-m', 'another name')
+    assert none in call(folder, monkeypatch, capsys)[1].out
+    # A statement of three is another one, and one is new: half of four.
+    changed = commit(folder, 'code/loops.py', 'begin\nfast\nend\nreport\n')
     code, said = call(folder, monkeypatch, capsys)
     row = next(line for line in said.out.splitlines() if line.startswith('Speed'))
-    assert code == 0 and row.split()[-2:] == ['2026-01-02', '2']
-    assert changed[:7] not in said.out and '1 entries: 1 older than their code' in said.out
+    assert code == 0 and row.split()[-3:] == ['2026-01-02', '50', '%']
+    assert changed[:7] not in said.out
+    assert '1 entries: 1 older than their code (1 by over 10 %)' in said.out
     code, said = call(folder, monkeypatch, capsys, '--changed')
-    assert changed[:7] in said.out and 'code/loop.py is changed' in said.out
+    assert changed[:7] in said.out and 'code/loops.py is changed' in said.out
     assert 'README.md is changed' not in said.out
     assert max(map(len, said.out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize('share, said', [(0, '0 %'), (0.0001, '<1 %'), (0.006, '1 %'),
+                                         (1, '100 %')])
+def test_a_small_share_is_not_none(share, said):
+    assert figures.percent(share) == said
 
 
 @pytest.mark.slow
