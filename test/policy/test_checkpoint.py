@@ -11,6 +11,7 @@ import torch
 from vn_nav.errors import UserError
 from vn_nav.policy.batched import BatchedPolicy
 from vn_nav.policy.checkpoint import load_checkpoint, save_checkpoint
+from vn_nav.policy.checkpoint_info import TRIAL
 from vn_nav.policy.network import Policy
 from vn_nav.policy.network_config import HEADS, NetworkConfig
 from vn_nav.policy.runtime import PolicyRuntime
@@ -52,6 +53,22 @@ def test_checkpoints_come_back(tmp_path, changes):
     assert all(torch.equal(tensor, state[name]) for name, tensor in network.state_dict().items())
     assert sorted(path.name for path in (tmp_path / 'model').iterdir()) == [
         'README.md', 'config.json', 'model.safetensors']
+
+
+def test_a_trial_stays_with_the_policy_that_drove_it(tmp_path):
+    folder, network = tmp_path / 'model', Policy(SMALL)
+    save_checkpoint(folder, network, {**FACTS, 'stop_threshold': 0.5})
+    (folder / TRIAL).write_text('{}')
+    measured = {**FACTS, 'stop_threshold': 0.5, 'notes': 'Measured once more.'}
+    save_checkpoint(folder, network, measured)
+    assert (folder / TRIAL).read_text() == '{}'
+    assert load_checkpoint(folder).info['notes'] == 'Measured once more.'
+    for info, driver in (({**measured, 'stop_threshold': 0.9}, network),
+                         ({**measured, 'world_version': '2'}, network), (measured, Policy(SMALL))):
+        save_checkpoint(folder, network, measured)
+        (folder / TRIAL).write_text('{}')
+        save_checkpoint(folder, driver, info)
+        assert not (folder / TRIAL).exists()
 
 
 def test_damage_is_refused(tmp_path):

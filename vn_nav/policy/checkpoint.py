@@ -58,6 +58,8 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
                     half: bool = False) -> None:
     """Write a checkpoint; the folder appears, or is replaced, whole or not at all.
 
+    The trial of a policy that drives alike stays in it.
+
     Args:
         folder: where; its parent is made.
         network: the policy, with the place that it was taught.
@@ -83,6 +85,8 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
     files = {WEIGHTS: weights} if place is None else {WEIGHTS: weights, PLACE: place}
     parameters = sum(tensor.numel() for tensor in tensors.values())
     files |= {CONFIG: text.encode(), CARD: model_card(config, parameters, len(weights)).encode()}
+    if _drives_as(folder, config) and (folder / TRIAL).is_file():
+        files[TRIAL] = (folder / TRIAL).read_bytes()
     try:
         _write_folder(folder, files)
     except OSError as error:
@@ -90,6 +94,16 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
                         f'{error.filename or folder}: {error.strerror}',
                         'free some space, or choose a folder that may be written: the checkpoint '
                         'before is whole') from error
+
+
+def _drives_as(folder: Path, config: dict) -> bool:
+    """Whether a folder's checkpoint drives as that of a configuration: what is kept is of both."""
+    try:
+        before, _ = read_config(folder)
+    except UserError:  # none, or one that nobody reads any more
+        return False
+    return all(before.get(key) == config.get(key) for key in (
+        'sha256', PLACE_CHECKSUM, 'stop_threshold', 'world_version'))
 
 
 def taught_bytes(network: Policy) -> bytes | None:
@@ -214,7 +228,7 @@ def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
     """Write a folder that appears, or is replaced, whole or not at all."""
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # What was made of the checkpoint before goes with it: an export, a trial.
+    # What was made of the checkpoint before goes with it: an export, a trial of another policy.
     if folder.exists() and any(path.name not in (WEIGHTS, CONFIG, CARD, PLACE, EXPORT, TRIAL)
                                for path in folder.iterdir()):
         raise UserError('only a checkpoint folder is replaced by a checkpoint', str(folder),
