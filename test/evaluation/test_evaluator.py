@@ -2,11 +2,13 @@
 
 import functools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from vn_nav.cli.world import long_rows
 from vn_nav.errors import UserError
 from vn_nav.evaluation.evaluator import (
     PolicyActor,
@@ -144,12 +146,26 @@ def test_many_houses_are_measured_in_parts(monkeypatch):
         made.append((scenes, environments))
         return make_env(scenes, environments, stop, limit=10)
     monkeypatch.setattr('vn_nav.evaluation.evaluator.SCENES_AT_ONCE', 2)
+    grown = []
     rows = measure(make, make_network(), ['house:7', 'house:8', 'house:9'],
-                   decoding='greedy', episodes=5, controls=())
+                   decoding='greedy', episodes=5, controls=(),
+                   on_row=lambda *row: grown.append(row))
+    assert grown == [('arrival', 'right goal, greedy', count) for count in (4, 6)]
     assert made == [(['house:7', 'house:8'], 4), (['house:9'], 2)]
     episodes = rows['arrival']['right goal, greedy']
     assert sorted(e.scene for e in episodes) == [
         f'house:{seed}' for seed in (7, 7, 8, 8, 9, 9)]
+
+
+def test_rows_that_take_long_are_said(monkeypatch, capsys):
+    clock = iter([0.0, 20.0, 620.0, 650.5])
+    monkeypatch.setattr('vn_nav.cli.world.time', SimpleNamespace(monotonic=lambda: next(clock)))
+    say = long_rows()
+    say('arrival', 'right goal, greedy', 12)
+    say('declared', 'wrong goal', 232)
+    say('declared', 'blank goal', 232)
+    assert capsys.readouterr() == ('', 'Declared stop, wrong goal: 232 episodes, 10 min\n'
+                                       'Declared stop, blank goal: 232 episodes, 11 min\n')
 
 
 def test_a_declared_stop_is_measured_beside_arrival():

@@ -20,6 +20,7 @@ from vn_nav.cli.world import (
     check_backend,
     check_version,
     load_for,
+    long_rows,
     make_env_for,
 )
 from vn_nav.errors import UserError
@@ -115,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
             _drive(args, checkpoint, robot, args.cache or Path(decoded), odometry) if args.bag else
             _scenes(args, checkpoint, odometry))
         done = evaluate(checkpoint, splits, make_env, config, name=str(args.checkpoint), bag=bag,
-                        on_split=show)
+                        on_split=show, on_row=long_rows())
     if args.json:
         write_file(args.json, json.dumps(done.result, indent=2).encode())
     if args.html:

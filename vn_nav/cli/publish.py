@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vn_nav.cli.scenes import SPLIT_SCENES, UNSEEN_GOALS, checkpoint_scenes, split_scenes
-from vn_nav.cli.world import load_for_scenes, machine, make_env_for
+from vn_nav.cli.world import load_for_scenes, long_rows, machine, make_env_for
 from vn_nav.errors import UserError
 from vn_nav.evaluation import evaluator
 from vn_nav.evaluation.measurement import EvaluateConfig, measure_checkpoint, odometry_for
@@ -174,7 +174,7 @@ def _measure(checkpoint: LoadedCheckpoint, place: _Place, args: argparse.Namespa
                             goal_seed=place.goal_seed)
     config = EvaluateConfig(episodes=args.episodes, **changes,
                             robot=load_robot(args.robot) if args.robot else None)
-    return measure_checkpoint(checkpoint, place.scenes, make, config)
+    return measure_checkpoint(checkpoint, place.scenes, make, config, long_rows())
 
 
 def _stop_threshold(checkpoint: LoadedCheckpoint, places: dict[str, _Place],

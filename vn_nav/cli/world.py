@@ -7,6 +7,8 @@ import functools
 import math
 import os
 import platform
+import sys
+import time
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +18,7 @@ from vn_nav.errors import UserError
 from vn_nav.scenes import BAG, ROOMS
 
 if TYPE_CHECKING:
+    from vn_nav.evaluation.evaluator import OnRow
     from vn_nav.robot import RobotSpec
     from vn_sim_bridge.render.randomisation import Randomisation
 
@@ -23,6 +26,7 @@ SAY = functools.partial(print, flush=True)
 # Values of --motion-noise, as options of `EnvConfig`.
 MOTION_NOISE: dict[str, dict[str, Any]] = {
     'all': {}, 'moves': {'turn_noise': False}, 'none': {'noise': 0.0}}
+LONG_S = 30.0  # that a row of episodes takes, to be said
 BACKENDS = ('house',)  # of --house and --houses; other scenes are named by --scene
 
 
@@ -241,6 +245,21 @@ def _trained_robot(info: dict):
     from vn_nav.robot import RobotSpec
     from vn_sim_bridge.simulators import robot_for
     return robot_for(info['scenes']) if info['scenes'] else RobotSpec()
+
+
+def long_rows() -> OnRow:
+    """What says on stderr, while hours of episodes are driven, which rows are done."""
+    from vn_nav.report.tables import TITLES
+    begun = before = time.monotonic()
+
+    def say(stop: str, name: str, count: int) -> None:
+        nonlocal before
+        now = time.monotonic()
+        if now - before > LONG_S:
+            print(f'{TITLES[stop]}, {name}: {count} episodes, {(now - begun) / 60:.0f} min',
+                  file=sys.stderr, flush=True)
+        before = now
+    return say
 
 
 def load_for_scenes(path: Path, robot: Path | None = None):

@@ -23,6 +23,7 @@ from vn_nav.vector_env import ExploringEnv, MeasuredVectorEnv
 
 Actor = Callable[[dict, np.ndarray], np.ndarray]  # (observation, reset [N]) -> actions [N]
 Rows = dict[str, dict[str, list[Episode]]]  # 'arrival' or 'declared', then a row's name
+OnRow = Callable[[str, str, int], None]  # the same of a row, and its number of episodes so far
 ARRIVAL, DECLARED = 'arrival', 'declared'  # what ends an episode before its limit
 STOPS = (ARRIVAL, DECLARED)
 OTHER, WRONG, ABSENT, BLANK, RANDOM, EXPLORER, SHORTEST = (
@@ -210,7 +211,8 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
             episodes: int = 100, controls: Sequence[str] = CONTROLS,
             threshold: float | None = None, seed: int = 10_000, known: Sequence[str] = (),
             robot: RobotSpec | None = None, camera_fov: float | None = None,
-            stops: Sequence[str] = STOPS, own: bool = True, verify: str = NONE) -> Rows:
+            stops: Sequence[str] = STOPS, own: bool = True, verify: str = NONE,
+            on_row: OnRow = lambda stop, name, count: None) -> Rows:
     """Episodes of a policy and of its controls, the same number in each scene.
 
     A network that can declare its stop is measured a second time, with declared stops.
@@ -231,6 +233,7 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
         stops: which of `STOPS`.
         own: the policy itself drives to its goals; else the controls alone.
         verify: see `PolicyActor`.
+        on_row: called as a row gets longer.
 
     Returns:
         By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
@@ -254,9 +257,10 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
                                      known, camera_fov, own, verify)
                 for name, (actor, shown) in actors.items():
                     env.set_shown_goal(shown)
-                    rows.setdefault(stop, {}).setdefault(name, []).extend(run_episodes(
-                        env, actor, rounds * environments, seed=seed + chunk,
-                        robot=robot or env.robot))
+                    row = rows.setdefault(stop, {}).setdefault(name, [])
+                    row.extend(run_episodes(env, actor, rounds * environments, seed=seed + chunk,
+                                            robot=robot or env.robot))
+                    on_row(stop, name, len(row))
                 if env.config.task != 'image' or env.simulator.capabilities.rewards:
                     break  # nothing to declare
     return rows

@@ -142,7 +142,9 @@ def ranges_for(network: Policy, wanted: str | None = None) -> str:
 
 
 def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make_env: Callable,
-                       config: EvaluateConfig) -> evaluator.Rows:
+                       config: EvaluateConfig,
+                       on_row: evaluator.OnRow = lambda stop, name, count: None
+                       ) -> evaluator.Rows:
     """Episodes of a checkpoint in some scenes; see `evaluator.measure`."""
     info, controls = checkpoint.info, list(config.controls)
     if info['task'] == 'collect':  # no goal: none to show wrong, and no shortest path to it
@@ -171,7 +173,7 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
         make, checkpoint.network, scenes, known=info['scenes'],
         decoding=config.decoding or info['decoding'], episodes=config.episodes,
         controls=controls, seed=config.seed, robot=config.robot, stops=config.stops,
-        own=config.policy, verify=config.verify,
+        own=config.policy, verify=config.verify, on_row=on_row,
         camera_fov=math.radians(info['camera_fov_deg']),
         threshold=(info.get('stop_threshold') if config.stop_threshold is None
                    else config.stop_threshold))
@@ -180,7 +182,8 @@ def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make
 def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
              make_env: Callable, config: EvaluateConfig | None = None, *, name: str = '',
              bag: str | None = None,
-             on_split: Callable[[str, dict], None] = lambda split, result: None) -> Evaluation:
+             on_split: Callable[[str, dict], None] = lambda split, result: None,
+             on_row: evaluator.OnRow = lambda stop, name, count: None) -> Evaluation:
     """Measure a checkpoint and its controls in every split.
 
     Args:
@@ -192,6 +195,7 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
         name: of the checkpoint, for the result.
         bag: name of the recorded drive that the environments are made of; None: scenes.
         on_split: called with the name and the whole result after each split.
+        on_row: see `evaluator.measure`.
 
     Raises:
         UserError: no split.
@@ -218,7 +222,8 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
                                        env.robot.camera_height))
             return env
 
-        measured = done.measured[split] = measure_checkpoint(checkpoint, scenes, make, config)
+        measured = done.measured[split] = measure_checkpoint(checkpoint, scenes, make, config,
+                                                             on_row)
         done.result = done.result or new_result(
             {**checkpoint.info, **world}, checkpoint=name, bag=bag,
             max_decisions=configs[0].max_decisions, odometry=configs[0].odometry,
