@@ -212,7 +212,7 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
             threshold: float | None = None, seed: int = 10_000, known: Sequence[str] = (),
             robot: RobotSpec | None = None, camera_fov: float | None = None,
             stops: Sequence[str] = STOPS, own: bool = True, verify: str = NONE,
-            on_row: OnRow = lambda stop, name, count: None) -> Rows:
+            on_row: OnRow | None = None) -> Rows:
     """Episodes of a policy and of its controls, the same number in each scene.
 
     A network that can declare its stop is measured a second time, with declared stops.
@@ -233,7 +233,7 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
         stops: which of `STOPS`.
         own: the policy itself drives to its goals; else the controls alone.
         verify: see `PolicyActor`.
-        on_row: called as a row gets longer.
+        on_row: called as a row gets longer; None: nobody is told.
 
     Returns:
         By kind of stop and by row: {'arrival': {'right goal, sample': episodes, ...},
@@ -260,7 +260,8 @@ def measure(make_env: Callable, network: Policy, scenes: Sequence[str], *, decod
                     row = rows.setdefault(stop, {}).setdefault(name, [])
                     row.extend(run_episodes(env, actor, rounds * environments, seed=seed + chunk,
                                             robot=robot or env.robot))
-                    on_row(stop, name, len(row))
+                    if on_row is not None:
+                        on_row(stop, name, len(row))
                 if env.config.task != 'image' or env.simulator.capabilities.rewards:
                     break  # nothing to declare
     return rows

@@ -142,8 +142,7 @@ def ranges_for(network: Policy, wanted: str | None = None) -> str:
 
 
 def measure_checkpoint(checkpoint: LoadedCheckpoint, scenes: Sequence[str], make_env: Callable,
-                       config: EvaluateConfig,
-                       on_row: evaluator.OnRow = lambda stop, name, count: None
+                       config: EvaluateConfig, on_row: evaluator.OnRow | None = None
                        ) -> evaluator.Rows:
     """Episodes of a checkpoint in some scenes; see `evaluator.measure`."""
     info, controls = checkpoint.info, list(config.controls)
@@ -183,7 +182,7 @@ def evaluate(checkpoint: LoadedCheckpoint, splits: Mapping[str, Sequence[str]],
              make_env: Callable, config: EvaluateConfig | None = None, *, name: str = '',
              bag: str | None = None,
              on_split: Callable[[str, dict], None] = lambda split, result: None,
-             on_row: evaluator.OnRow = lambda stop, name, count: None) -> Evaluation:
+             on_row: evaluator.OnRow | None = None) -> Evaluation:
     """Measure a checkpoint and its controls in every split.
 
     Args:

@@ -85,9 +85,9 @@ def save_checkpoint(folder: str | Path, network: Policy, info: dict, *,
     files = {WEIGHTS: weights} if place is None else {WEIGHTS: weights, PLACE: place}
     parameters = sum(tensor.numel() for tensor in tensors.values())
     files |= {CONFIG: text.encode(), CARD: model_card(config, parameters, len(weights)).encode()}
-    if _drives_as(folder, config) and (folder / TRIAL).is_file():
-        files[TRIAL] = (folder / TRIAL).read_bytes()
     try:
+        if (folder / TRIAL).is_file() and _drives_as(folder, config):
+            files[TRIAL] = (folder / TRIAL).read_bytes()
         _write_folder(folder, files)
     except OSError as error:
         raise UserError(f'a checkpoint can be written ({len(weights) / 1e6:.1f} MB)',
